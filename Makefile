@@ -1,0 +1,76 @@
+# metro.h: everything is built with cc and make.
+#
+#   make            the examples, into build/
+#   make paper      every figure, chart and table of the paper, into out/ (QUICK=1: a small version within a minute)
+#   make test       the tests; ends with one line "N passed, N failed"
+#   make docs       the book, into out/book/, with the checks of its prose
+#   make check      the tests again under every compiler, sanitizer, emulator and fuzzer that is installed
+#   make bench      speed, as ratios and times
+#   make calibrate  long statistical studies of the stated errors
+#   make references remakes the committed reference pictures and figures
+#   make install    copies metro.h to $(DESTDIR)$(PREFIX)/include
+
+CC ?= cc
+CFLAGS ?= -O2
+PREFIX ?= /usr/local
+LDLIBS = -lm -lpthread
+WARNINGS = -std=c99 -Wall -Wextra -pedantic
+
+CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)
+MAKEFLAGS += -j$(CORES) --no-print-directory
+
+EXAMPLES := $(patsubst examples/%.c,build/%,$(sort $(wildcard examples/*.c)))
+TESTS := $(patsubst tests/%.c,build/%,$(sort $(wildcard tests/test_*.c)))
+TEST_LOGS := $(TESTS:=.log)
+
+.PHONY: all paper test docs check bench calibrate references install uninstall clean always
+all: $(EXAMPLES) build/weave
+
+build out:
+	@mkdir -p $@
+
+build/test_%: tests/test_%.c tests/check.h metro.h examples/plot.h | build
+	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
+
+build/bench_%: tests/bench_%.c metro.h | build
+	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
+
+build/weave: docs/weave.c | build
+	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $<
+
+build/%: examples/%.c examples/plot.h metro.h | build
+	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
+
+# Each test runs to its end and leaves a log; the sum over the logs is the last line, and decides.
+%.log: % always
+	@$< > $@ 2>&1 || true
+
+test: $(TEST_LOGS) build/test_weave.log
+	@sh tests/summary.sh $^
+
+build/test_weave.log: build/weave tests/test_weave.sh always
+	@sh tests/test_weave.sh build/weave > $@ 2>&1 || true
+
+paper: $(EXAMPLES) build/weave | out
+	@sh examples/paper.sh
+	@sh docs/book.sh
+
+docs: build/weave
+	@sh docs/book.sh --check
+
+check: $(TESTS) build/weave docs
+	@CC="$(CC)" sh tests/matrix.sh
+
+bench: build/bench_laboratory
+	@build/bench_laboratory
+	@sh tests/bench_compile.sh
+
+install:
+	install -d $(DESTDIR)$(PREFIX)/include
+	install -m 644 metro.h $(DESTDIR)$(PREFIX)/include/metro.h
+
+uninstall:
+	rm -f $(DESTDIR)$(PREFIX)/include/metro.h
+
+clean:
+	rm -rf build out

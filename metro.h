@@ -1,0 +1,7854 @@
+/* metro.h - Metropolis sampling and its start-up bias, in one C header. Version 0.1.0. License MIT-0 (at the end of
+   the file).
+
+   A Markov chain starts somewhere, and for a while its samples tell of that place. How long? How far off is a picture
+   made of such samples, and how much of what is wrong with it is the start, how much the noise of samples that follow
+   each other closely? Szirmay-Kalos, Dornbach and Purgathofer asked this in 1999 ("On the start-up bias problem of
+   Metropolis sampling"). This header answers in formulas that are exact to twelve digits, in a sampler that shows the
+   same numbers, and in pictures. It is also a book: read it from here to the end, or weave it into HTML with `make
+   docs`.
+
+   To use it, drop this file beside a program. In one of its C or C++ files write
+
+       #define METRO_IMPLEMENTATION
+       #include "metro.h"
+
+   and in all others the second line only; then `cc -O2 program.c -lm` builds it. C99, C11, C17 and C++11 will do, and
+   nothing is needed but libc and libm. These may be defined before the include:
+
+   - METRO_STATIC: all functions are static, so that several files may carry their own copy.
+   - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
+   - METRO_ASSERT: what a programmer's error ends in; assert by default.
+   - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
+   - METRO_NO_TRACER: leaves out the chapters on light, so that a lesson on the sampler compiles in a blink.
+
+   This program asks both the theory and an experiment how much a chain remembers of its seed:
+
+       #define METRO_IMPLEMENTATION
+       #include "metro.h"
+
+       int main(void)
+       {
+           metro_kernel kernel = { METRO_UNIFORM, 0.1, 0, 0 };
+           metro_rng rng = metro_rng_make(1, 0);
+           double x = 0.0;
+           int n;
+           for (n = 1; n <= 1000; n++) {
+               x = metro_kernel_perturb(&kernel, x, &rng);
+               if (n % 200 == 0)
+                   printf("step %d: at %.3f, E_n = %.2g\n", n, x, metro_startup_error(&kernel, (uint64_t)n));
+           }
+           return 0;
+       }
+
+   Conventions. Public names begin with metro_, private ones with metroi_. Lengths are in units of the domain, whose
+   length is 1; angles are in radians. Structs of options mean their defaults when zero. A function that can fail
+   returns a metro_result, 0 for success, and leaves its outputs untouched on failure; a number that cannot be
+   computed is NaN. There are no globals: two threads may use two chains. The same seed gives the same numbers on any
+   number of threads.
+
+   How the book is written. Comments that begin in the first column are its prose, the code between them its listings.
+   An equation stands on lines of its own with its number, and `eq 4.2` in code or prose refers to it; `paper (12)` is
+   equation (12) of the paper, and appendix A says for each of those where it stands here and what was wrong with it.
+
+   Contents
+
+       R1 Ground
+       R2 Randomness
+       R3 Perturbations
+       R4 The chain
+       R5 Start-up theory
+       R5.1 Start-up theory on the sphere and of a run
+       R6 The operator
+       R7 Diagnostics
+       R8 Pictures
+       1 Ground
+       1.1 Results
+       1.2 Vectors
+       1.3 Rounds of jobs
+       2 Randomness
+       2.1 Streams
+       2.2 Sums and moments
+       2.3 Points that fill the cube evenly
+       3 Perturbations
+       3.1 Points and turns
+       3.2 Arguments without loss
+       3.3 What is a kernel
+       3.4 Drawing a step
+       3.5 The spectrum of Kelemen's kernel
+       3.6 Ratios of Bessel functions
+       3.7 One mode at a time
+       3.8 Densities on the circle
+       3.9 Directions
+       3.10 Spectra on the sphere
+       4 The chain
+       4.1 Acceptance
+       4.2 The space
+       4.3 Making a chain
+       4.4 A step
+       4.5 Starting
+       4.6 Veach's weighted seeds
+       4.7 Burn-in and the normalisation
+       5 Start-up theory
+       5.1 Steps add up
+       5.2 The series and the error
+       5.3 Numbers that outlive the double
+       5.4 When to stop
+       5.5 The sum over modes
+       5.6 A shorter circle
+       5.7 Uniform perturbations
+       5.8 Gaussian, Cauchy and von Mises perturbations
+       5.9 Kelemen's perturbations
+       5.10 Large steps
+       5.11 Many seeds
+       5.12 The interval
+       5.13 More dimensions
+       5.14 The running mean
+       5.15 The density itself
+       5.16 Other distances
+       5.17 The sphere
+       5.18 The error of a run
+       5.19 Covariances by doubling
+       5.20 A chain that starts in equilibrium
+       5.21 The best size
+       6 The operator
+       6.1 From an importance to a matrix
+       6.2 What the seed leaves behind
+       6.3 Distances, and the atom of rejections
+       6.4 The spectrum
+       6.5 The error of a run, for every seed
+       6.6 The exponential
+       6.7 The best size
+       7 Diagnostics
+       7.1 Numbers and their spread
+       7.2 Bernstein's formula
+       7.3 Autocorrelation
+       7.4 The autocorrelation time
+       7.5 The error of a mean
+       7.6 Ranks
+       7.7 R-hat
+       7.8 Bulk and tail
+       7.9 The squared jump
+       7.10 Bias and variance apart
+       7.11 What cannot be said
+       7.12 Detailed balance
+       7.13 Measuring the start-up error
+       8 Pictures
+       8.1 The picture
+       8.2 Colour
+       8.3 Numbers in text
+       8.4 Reading
+       8.5 Writing
+       8.6 The error of a picture
+       A Equations of the paper
+       B Symbols
+       C License
+
+   Stop here if you only want to use the header: the interface comes next, and its comments are the contracts.
+   The chapters follow it. */
+
+#ifndef METRO_H
+#define METRO_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#define METRO_VERSION "0.1.0"
+#define METRO_VERSION_MAJOR 0
+#define METRO_VERSION_MINOR 1
+#define METRO_VERSION_PATCH 0
+
+#if defined(__GNUC__) || defined(__clang__)
+#define METROI_UNUSED __attribute__((unused))
+#else
+#define METROI_UNUSED
+#endif
+#ifndef METRO_API
+#ifdef METRO_STATIC
+#define METRO_API METROI_UNUSED static
+#else
+#define METRO_API extern
+#endif
+#endif
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* # R1 Ground
+
+   Every function that can fail returns a `metro_result`. Zero is success; anything else is an error, and then the
+   outputs are as they were before the call. */
+
+typedef enum {
+    METRO_OK = 0,
+    METRO_ERROR_ARGUMENT,      /* an argument is outside the range that its contract names */
+    METRO_ERROR_MEMORY,        /* an allocation failed */
+    METRO_ERROR_FILE,          /* a file cannot be opened, read or written */
+    METRO_ERROR_FORMAT,        /* a file is not what it claims to be */
+    METRO_ERROR_DARK_SEED,     /* a seed has zero importance: the chain could not leave a state it never takes */
+    METRO_ERROR_BAD_SEED,      /* a seed has negative, infinite or NaN importance */
+    METRO_ERROR_NO_IMPORTANCE, /* no candidate has positive importance */
+    METRO_ERROR_STOPPED        /* the caller's `stop` ended the run early; what was merged until then stands */
+} metro_result;
+
+/* The result in words, as a sentence that says what to do. Never NULL; the string is constant. */
+METRO_API const char *metro_result_text(metro_result result);
+
+/* A vector or a direction in space. */
+typedef struct {
+    double x, y, z;
+} metro_vec3;
+
+METRO_API metro_vec3 metro_vec3_make(double x, double y, double z);
+METRO_API metro_vec3 metro_add(metro_vec3 a, metro_vec3 b);
+METRO_API metro_vec3 metro_subtract(metro_vec3 a, metro_vec3 b);
+METRO_API metro_vec3 metro_scale(metro_vec3 a, double factor);
+METRO_API metro_vec3 metro_cross(metro_vec3 a, metro_vec3 b);
+METRO_API double metro_dot(metro_vec3 a, metro_vec3 b);
+METRO_API double metro_length(metro_vec3 a);
+
+/* The vector of length 1 along `a`, safe for components from 1e-300 to 1e300. The zero vector and vectors with a
+   component that is not finite give (NaN, NaN, NaN). */
+METRO_API metro_vec3 metro_normalize(metro_vec3 a);
+
+/* Long runs are cut into rounds, and a round into jobs. The number of jobs is part of the problem, never of the
+   machine: a job draws from its own random stream, writes only to its own slot, and the slots are merged in the order
+   of jobs. So the answer is the same, bit for bit, on one thread or on sixty-four. */
+typedef struct {
+    uint64_t rounds;         /* how many rounds; 0 means 1 */
+    uint64_t first_round;    /* the number of the first one, to go on where an earlier run ended */
+    size_t jobs;             /* jobs in a round; 0 means 16 */
+    size_t slot_size;        /* bytes that a job writes; 0 is allowed */
+    size_t threads;          /* 0 means one a core */
+    /* Does job `job` (counted over all rounds: round * jobs + index) and leaves its outcome in `slot`, which arrives
+       zeroed. Runs on any thread, and must not write anything that `user` reaches. */
+    metro_result (*work)(uint64_t job, void *slot, void *user);
+    /* Takes the slot of one job into the result; called on the caller's thread, in the order of jobs. May be NULL. */
+    metro_result (*merge)(uint64_t job, const void *slot, void *user);
+    /* Asked after each whole round, with the number of rounds done; nonzero ends the run with METRO_ERROR_STOPPED. */
+    int (*stop)(uint64_t rounds_done, void *user);
+} metro_rounds;
+
+/* Runs `plan`, handing `user` to its functions. Returns METRO_OK after the last round, METRO_ERROR_STOPPED when
+   `stop` asked for it, METRO_ERROR_MEMORY, METRO_ERROR_ARGUMENT (`work` is NULL or the slots overflow a size), or the
+   first result other than METRO_OK that a job returned, in the order of jobs; the round of that job is not merged.
+   Costs jobs * slot_size bytes and one thread creation a thread and round. */
+METRO_API metro_result metro_rounds_run(const metro_rounds *plan, void *user);
+
+/* The number of cores this process may use, at least 1. */
+METRO_API size_t metro_core_count(void);
+
+/* # R2 Randomness
+
+   A stream of random numbers is a small value: copy it and both copies go on alike. */
+
+typedef struct metro_rng {
+    uint64_t state[4];
+} metro_rng;
+
+/* A stream for (seed, stream). Streams of different pairs start at unrelated places of a period of 2^256 - 1.
+   Cost: some 10 ns. Source: xoshiro256++ (Blackman and Vigna 2021), its state filled by SplitMix64. */
+METRO_API metro_rng metro_rng_make(uint64_t seed, uint64_t stream);
+
+/* The next 64 random bits. */
+METRO_API uint64_t metro_rng_next(metro_rng *rng);
+
+/* A uniform number in [0, 1), a multiple of 2^-53. */
+METRO_API double metro_rng_uniform(metro_rng *rng);
+
+/* A uniform whole number in 0 .. bound - 1, without bias; 0 when bound is 0. Source: Lemire (2019). */
+METRO_API uint64_t metro_rng_below(metro_rng *rng, uint64_t bound);
+
+/* A standard normal number. Source: Box and Muller (1958); two uniforms a call, so that the stream stays in step. */
+METRO_API double metro_rng_normal(metro_rng *rng);
+
+/* A uniform direction. Source: Archimedes: the height of a uniform point of the sphere is uniform. */
+METRO_API metro_vec3 metro_rng_direction(metro_rng *rng);
+
+/* A sum that keeps what rounding would lose: the error does not grow with the number of terms. Source: Neumaier
+   (1974). Start from { 0, 0 }. */
+typedef struct {
+    double sum, lost;
+} metro_sum;
+
+METRO_API void metro_sum_add(metro_sum *sum, double term);
+METRO_API double metro_sum_value(const metro_sum *sum);
+
+/* Mean and standard error of values that arrive one by one, safe from 1e-300 to 1e300. Start from { 0, 0, 0, 0 }. */
+typedef struct {
+    uint64_t count;
+    double scale;    /* the largest magnitude so far: the moments are kept relative to it */
+    double mean;     /* of value / scale */
+    double squares;  /* sum of squared deviations of value / scale */
+} metro_moments;
+
+METRO_API void metro_moments_add(metro_moments *moments, double value);
+METRO_API double metro_moments_mean(const metro_moments *moments);     /* NaN when empty */
+METRO_API double metro_moments_variance(const metro_moments *moments); /* unbiased; NaN under two values */
+METRO_API double metro_moments_error(const metro_moments *moments);    /* of the mean; NaN under two values */
+
+/* Coordinate `dimension` (0 .. 31) of point `index` of a scrambled Sobol sequence, in [0, 1), a multiple of 2^-53.
+   The points of one `scramble` fill the cube evenly, so a mean over them has a smaller error than over random ones;
+   over all scrambles each point is uniform, so the mean is unbiased, and the means of a few scrambles show its error.
+   Take the points from index 0 and a power of two of them. Each 2^24 points are scrambled afresh. A path that needs
+   more than 32 coordinates takes the later ones from a stream. NaN when `dimension` is 32 or more. Cost: some tens of
+   ns. Sources: Sobol (1967) with the numbers of Joe and Kuo (2008); scrambling of Owen (1995). */
+METRO_API double metro_sobol(uint64_t index, unsigned dimension, uint64_t scramble);
+
+/* # R3 Perturbations
+
+   A perturbation kernel says where the next tentative sample may fall, seen from the current one. Each kernel comes
+   three times: drawn, as a density, and as a spectrum, for the circle, for the interval and for the sphere. */
+
+typedef enum {
+    METRO_UNIFORM,
+    METRO_TRIANGLE,
+    METRO_GAUSSIAN,
+    METRO_CAUCHY,
+    METRO_VON_MISES,
+    METRO_KELEMEN
+} metro_shape;
+
+/* A symmetric kernel in one dimension. It has no defaults: a `size` of 0 is an invalid kernel, except that a von
+   Mises kernel of concentration 0 is the uniform draw. A kernel is valid when `shape` is one of the six, `size` is
+   positive (METRO_VON_MISES: not negative) and finite, `large` lies in 0 .. 1, and for METRO_KELEMEN 0 < `size_min`
+   <= `size`. Sizes above 1 are allowed: the kernel then wraps, or folds, more than once. */
+typedef struct {
+    metro_shape shape;
+    double size;     /* UNIFORM: full width Delta; TRIANGLE: full width of the base; GAUSSIAN: standard deviation;
+                        CAUCHY: scale gamma; VON_MISES: concentration kappa; KELEMEN: s2, the largest step.
+                        Lengths are in units of the domain, whose length is 1. */
+    double size_min; /* KELEMEN: s1, the smallest step; others: ignored */
+    double large;    /* probability of an independent uniform draw instead (a "large step"), 0 .. 1 */
+} metro_kernel;
+
+/* Perturbs `x` on the circle of length 1 and returns the new point, always in [0, 1); any finite `x` is taken modulo
+   1. NaN when the kernel is invalid or `x` is not finite (random numbers may be used up then). While `large` is 0
+   nothing is drawn for it: METRO_UNIFORM is x + size * (metro_rng_uniform(rng) - 0.5), wrapped. A step of over 2^32
+   turns ends at a uniform point. Cost: 3 ns beside its random numbers for METRO_UNIFORM, up to 100 ns for the others.
+   Source: Best and Fisher (1979) for METRO_VON_MISES, Kelemen et al. (2002) for METRO_KELEMEN, inversion
+   elsewhere. */
+METRO_API double metro_kernel_perturb(const metro_kernel *k, double x, metro_rng *rng);
+
+/* The density, per unit length of the circle, of the perturbation that goes from `from` to `to`: wrapped, with the
+   large steps in it. The same, to the last bit, from `to` to `from`. At a jump (UNIFORM, KELEMEN) the mean of both
+   sides. KELEMEN with size_min == size has two atoms: +INFINITY there, 0 elsewhere (plus `large`). NaN when the
+   kernel is invalid or a point is not finite. Cost: under a microsecond. */
+METRO_API double metro_kernel_density(const metro_kernel *k, double from, double to);
+
+/* The Fourier coefficient P*(harmonic) of the kernel on the circle, paper (17) for METRO_UNIFORM: a real number, even
+   in `harmonic`, 1 at 0. NaN when the kernel is invalid. Absolute error below 1e-15 for harmonics to 1e6 and more;
+   zeros are exact. Cost: 20 ns; METRO_VON_MISES and METRO_KELEMEN: up to some microseconds. */
+METRO_API double metro_kernel_coefficient(const metro_kernel *k, long harmonic);
+
+/* The same three on the interval [0, 1] whose ends reflect: a point beyond an end comes back as far as it went over.
+   The new point lies in [0, 1) - the end 1 itself, met once in 2^53, is moved to the number below it, so that
+   (size_t)(n * x) is always a cell - and `x` beyond the ends is folded first. The coefficient is the eigenvalue mu_k
+   of cos(pi k x), the transform of the kernel at frequency k/2. METRO_VON_MISES lives on the circle only and gives
+   NaN. */
+METRO_API double metro_kernel_reflect_perturb(const metro_kernel *k, double x, metro_rng *rng);
+METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from, double to);
+METRO_API double metro_kernel_reflect_coefficient(const metro_kernel *k, long harmonic);
+
+/* A uniform direction of the cone around `from` (length 1) whose sides stand `half_angle` radians off its axis: the
+   apex angle of the paper's section 3.2 is twice that. From pi on the cone is the whole sphere. The result has length
+   1 to the last digits, however often it is perturbed. NaN components when `half_angle` is not positive and finite or
+   `from` is not of length 1 (its square off by over a per cent). Two random numbers, some 60 ns. Source: Archimedes;
+   the frame is that of Duff et al. (2017). */
+METRO_API metro_vec3 metro_cone_perturb(double half_angle, metro_vec3 from, metro_rng *rng);
+
+/* Its density per steradian between the unit vectors `from` and `to`, the same both ways. NaN as above. */
+METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_vec3 to);
+
+/* The eigenvalue lambda_l of the spherical harmonics of degree l = `degree` under the cone of `half_angle` radians.
+   NaN when `half_angle` is not positive and finite or `degree` is negative. Absolute error about 1e-15 at degree 1000
+   and 1e-14 at 1e5. Cost: some 10 ns times the degree. */
+METRO_API double metro_cone_coefficient(double half_angle, int degree);
+
+/* The von Mises-Fisher kernel exp(kappa cos theta) on the sphere, theta the angle from the unit vector `from`: drawn,
+   as a density per steradian, and its eigenvalue of degree `degree`. kappa = 0 is the uniform direction; NaN when
+   kappa is negative or not finite, `from` is not of length 1, or `degree` is negative. Cost: two random numbers and
+   some 60 ns; the coefficient at most 10 us. Source: Ulrich (1984) in the stable form of Jakob (2012). */
+METRO_API metro_vec3 metro_vmf_perturb(double kappa, metro_vec3 from, metro_rng *rng);
+METRO_API double metro_vmf_density(double kappa, metro_vec3 from, metro_vec3 to);
+METRO_API double metro_vmf_coefficient(double kappa, int degree);
+
+/* # R4 The chain
+
+   A target is a space, an importance on it and what to do with samples. The space is a list of axes. A circle or an
+   interval takes one coordinate of the state, in [0, 1]; a direction takes three, a vector of length 1. Volumes are
+   measured so that each axis has total volume 1: a uniform draw has density 1. */
+
+typedef enum { METRO_CIRCLE, METRO_INTERVAL, METRO_DIRECTION } metro_axis_kind;
+
+/* One axis and how it is perturbed. METRO_INTERVAL reflects at its ends and takes every shape but METRO_VON_MISES.
+   METRO_DIRECTION takes METRO_UNIFORM, a cone whose half-angle in radians is `size` (half the paper's apex angle), or
+   METRO_VON_MISES, the von Mises-Fisher kernel of concentration `size`. `large` must be 0 here: the large step of a
+   chain redraws all axes together and is an option of the chain. */
+typedef struct {
+    metro_axis_kind kind;
+    metro_kernel kernel;
+} metro_axis;
+
+/* What the chain samples. The functions get `user` as it stands here; the chain calls them and keeps nothing of them.
+   */
+typedef struct {
+    const metro_axis *axes;  /* [axis_count]; must outlive the chain */
+    size_t axis_count;
+    size_t sample_size;      /* bytes of a sample, may be 0 */
+    /* The importance I(z) >= 0 of the state z; whatever the target wants to record about z goes into `sample`. */
+    double (*importance)(const double *z, void *sample, void *user);
+    /* Takes a sample with its weight; the weights of a step sum to 1. NULL: nothing is recorded. */
+    void (*record)(const void *sample, double weight, void *user);
+    /* The tentative transition: writes the tentative state to `to` and returns T(to -> from) / T(from -> to). NULL:
+       each axis is perturbed by its kernel, which is symmetric. */
+    double (*propose)(const double *from, double *to, metro_rng *rng, void *user);
+    void *user;
+} metro_target;
+
+/* Zero is the default. */
+typedef struct {
+    double large_step;    /* probability that a tentative state is a uniform draw of all axes together, 0 .. 1 */
+    int expected_values;  /* nonzero: record the tentative state with weight a and the current one with 1 - a */
+} metro_chain_options;
+
+/* What a careful person asks a chain afterwards. */
+typedef struct {
+    uint64_t steps;          /* since the start or the end of the burn-in */
+    uint64_t accepted;
+    uint64_t longest_stay;   /* the most steps in a row that ended in the same state by rejection */
+    uint64_t stay;           /* the steps in a row up to this one */
+    uint64_t large_steps;    /* tentative states that were uniform draws */
+    uint64_t dark;           /* tentative states of zero importance */
+    uint64_t nan;            /* tentative states whose importance or transition ratio was NaN: rejected */
+    uint64_t negative;       /* ... or negative: rejected */
+    uint64_t infinite;       /* ... or infinite: rejected */
+    metro_sum squared_jump;  /* sum of a(i -> t) times the squared distance from i to t (radians for directions) */
+} metro_chain_counts;
+
+/* A chain. Read its members, write none. */
+typedef struct {
+    metro_target target;
+    metro_chain_options options;
+    metro_rng rng;
+    double *state;                 /* the current z: one double a circle or interval, three a direction */
+    double *tentative;
+    void *sample, *tentative_sample;
+    double importance;             /* of the current state; 0 before a start */
+    double weight;                 /* what the current sample has collected and not yet recorded */
+    double start_weight;           /* the weight W of a start from weighted seeds, else 1 */
+    metro_moments normalisation;   /* of the importances of independent uniform draws */
+    metro_chain_counts counts;
+    void *memory;
+} metro_chain;
+
+/* Makes a chain for `target` that draws from `rng`. `options` may be NULL. Returns METRO_ERROR_ARGUMENT for no axes,
+   no importance, a kernel that is not valid on its axis, or large_step outside [0, 1]; METRO_ERROR_MEMORY; on failure
+   `chain` is unchanged. Costs one allocation of two states and two samples; a step allocates nothing. */
+METRO_API metro_result metro_chain_make(const metro_target *target, const metro_chain_options *options, metro_rng rng,
+                                        metro_chain *chain);
+
+/* Frees what metro_chain_make allocated. A zeroed chain may be freed. */
+METRO_API void metro_chain_free(metro_chain *chain);
+
+/* Starts the chain at the state z, as the paper does. Returns METRO_ERROR_DARK_SEED if I(z) = 0, METRO_ERROR_BAD_SEED
+   if it is negative, infinite or NaN; the chain is then where it was. A start sets the counts to zero and keeps what
+   is known of b. */
+METRO_API metro_result metro_chain_start_point(metro_chain *chain, const double *z);
+
+/* Starts at the seed z_i, chosen with probability alpha_i (paper (13)). `seeds` states follow each other in z;
+   `alpha` has `seeds` numbers whose sum is 1 within 1e-9, or is NULL for equal ones. One dark or bad seed among them
+   refuses all, as in metro_chain_start_point, since it could be chosen. Cost: `seeds` importances. */
+METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double *z, const double *alpha,
+                                               size_t seeds);
+
+/* Starts at one of `candidates` uniform draws, chosen in proportion to its importance, and sets `start_weight` to
+   their mean importance: start_weight * (weighted mean of f / I) is then unbiased after any number of steps (Veach
+   and Guibas 1997; eq 4.6). Returns METRO_ERROR_NO_IMPORTANCE if all candidates are dark: start_weight is 0, steps
+   record nothing, and the estimate of this run is the 0 that keeps the mean over runs right. METRO_ERROR_ARGUMENT for
+   no candidates. The candidates also enter the normalisation. */
+METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t candidates);
+
+/* Makes `steps` steps without recording and sets the counts to zero: a burn-in. */
+METRO_API void metro_chain_burn(metro_chain *chain, uint64_t steps);
+
+/* Makes one step and returns 1 if the tentative state was accepted, else 0. A sample is recorded when the chain
+   leaves it: call metro_chain_flush before reading the result. */
+METRO_API int metro_chain_step(metro_chain *chain);
+
+/* Makes `steps` steps and flushes. */
+METRO_API void metro_chain_run(metro_chain *chain, uint64_t steps);
+
+/* Records what the current sample has collected so far. */
+METRO_API void metro_chain_flush(metro_chain *chain);
+
+/* Draws `samples` independent uniform states for the sake of b alone; the chain stays where it is. */
+METRO_API void metro_chain_survey(metro_chain *chain, uint64_t samples);
+
+/* b, the integral of the importance: the mean over all independent draws of the chain so far (candidates, survey,
+   large steps). NaN if there were none. If `error` is not NULL it gets the standard error, NaN under two draws. */
+METRO_API double metro_chain_b(const metro_chain *chain, double *error);
+
+/* # R5 Start-up theory
+
+   A chain of constant importance starts at a point, or at one of several seeds, and forgets it step by step. These
+   functions say, without a simulation, how far the density p_n of its n-th sample still is from the uniform density.
+   The start-up error E_n is the paper's: the root of the integral of (p_n - 1)^2, eq 5.6.
+
+   Common to all of them: n = 0 gives +INFINITY, because p_0 is a point mass; an invalid kernel (metro_kernel says
+   which are valid) gives NaN. A kernel that lands uniformly in one step (METRO_UNIFORM of whole `size`,
+   METRO_TRIANGLE of even `size`, METRO_VON_MISES of concentration 0, `large` = 1) has an error of exactly 0 for n >=
+   1. METRO_KELEMEN with `size_min` == `size` jumps between points, so its error is +INFINITY for every n (with
+   `large` = 1: 0). Nothing here allocates.
+
+   Each error comes a second time as its natural logarithm, which is finite where the error itself underflows:
+   -INFINITY means that the error is exactly 0.
+
+   Accuracy, unless said otherwise: relative 1e-12, or 1e-12 of the logarithm where that is larger. METRO_KELEMEN from
+   the third step on: the same while its sizes lie within some 1000 times of each other and `size_min` is above 1e-4;
+   beyond, 1e-9; and NaN where they lie so close together that millions of terms would not do. */
+
+/* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: under 10 microseconds for every n
+   and size (METRO_KELEMEN: up to 0.2 ms at n <= 2 and 30 ms at n = 3, falling fast from there). */
+METRO_API double metro_startup_error(const metro_kernel *k, uint64_t n);
+METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
+
+/* The same when the chain starts at `seed[i]` with probability `alpha[i]`, i < `seeds`: eq 5.31, which is paper (15)
+   corrected. `alpha` NULL means equal weights. Seeds are points of the circle and taken modulo 1. NaN when `seed` is
+   NULL or `seeds` is 0, when a seed is not finite, when a weight is negative or not finite, and when the weights do
+   not sum to 1 within 1e-9. Where seeds cancel modes (equispaced ones) the error is small against that of one seed,
+   and is known to 1e-13 of the latter, to 1e-8 for n <= 2; the logarithm is -INFINITY when nothing is left. Cost: for
+   n >= 3 proportional to `seeds`, some 50 ns times a number of modes that is about 100/size at n = 3 and 2/size from
+   n = 10 on; for n <= 2 (METRO_TRIANGLE: n = 1) and for seeds much farther apart than the chain has gone,
+   proportional to seeds^2 but without the modes. */
+METRO_API double metro_startup_error_seeds(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha,
+                                           size_t seeds);
+METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n, const double *seed,
+                                               const double *alpha, size_t seeds);
+
+/* The error of the running mean (p_burn + .. + p_{burn+steps-1})/steps, which is the density that a sample picked at
+   random among `steps` samples after a burn-in has; one seed; eq 5.38. burn = 0 includes p_0: +INFINITY. steps = 0:
+   NaN. Cost: 5 to 50 microseconds while burn + steps <= 1000 (METRO_KELEMEN: some ms); for METRO_UNIFORM and
+   METRO_TRIANGLE it grows with the square root of `steps`, to 10 ms at most for sizes from 1e-6. */
+METRO_API double metro_startup_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
+METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
+
+/* The density p_n at `x` (taken modulo 1) of a chain that starts as in metro_startup_error_seeds: eqs 5.5 and 5.30,
+   paper (9) and (14). n = 0: +INFINITY at a seed of positive weight, 0 elsewhere. n = 1: metro_kernel_density, so at
+   a jump the mean of both sides. NaN for the arguments that give NaN there, for an `x` that is not finite, and for
+   METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density. The error is below 1e-13 of the
+   largest value of p_n. Cost: some microseconds a seed; METRO_KELEMEN: 0.2 ms at n = 3 and 4, up to 50 ms at n = 5,
+   less beyond. */
+METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
+                                       const double *alpha, size_t seeds);
+
+/* The start-up error of a chain on a torus that perturbs `axes` circle coordinates at once, coordinate i by the
+   kernel `k[i]`, from one seed: eq 5.36. NaN for axes = 0 and when one of the kernels is invalid. Cost: that of the
+   axes. */
+METRO_API double metro_startup_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
+METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
+
+/* The start-up error on the interval [0, 1] with reflecting ends, from the seed `x0`: eq 5.34. A seed beyond the ends
+   is folded back; one that is not finite gives NaN, and so does METRO_VON_MISES, which lives on the circle only.
+   Accuracy and cost: as metro_startup_error_seeds with two seeds. */
+METRO_API double metro_reflect_startup_error(const metro_kernel *k, double x0, uint64_t n);
+METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x0, uint64_t n);
+
+/* Upper bounds of two other distances between p_n, from one seed, and the uniform density: the total variation (1/2)
+   int abs(p_n - 1), at most min(1, E_n/2), and the Kullback-Leibler divergence int p_n ln p_n in nats, at most ln(1 +
+   E_n^2): eqs 5.46 and 5.47. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
+   5.48 and 5.49. At n = 0 the distances are 1 and +INFINITY. */
+METRO_API double metro_startup_total_variation(const metro_kernel *k, uint64_t n);
+METRO_API double metro_startup_divergence(const metro_kernel *k, uint64_t n);
+
+/* # R5.1 Start-up theory on the sphere and of a run */
+
+/* The start-up error of a direction, from one seed, after `n` perturbations inside a cone of `half_angle` radians:
+   the L2 distance of p_n from the uniform density, both taken against the uniform probability on the sphere (for the
+   distance of the densities per steradian divide by sqrt(4 pi)), eq 5.50. And its natural logarithm, finite where the
+   error underflows; -INFINITY means that the error is exactly 0. n = 0 gives +INFINITY; from `half_angle` pi on and n
+   >= 1 the error is exactly 0. NaN when `half_angle` is not positive and finite. Relative error 1e-12, or 1e-12 of
+   the logarithm where that is larger. Cost: under 50 microseconds for every n and angle. The half angle is half the
+   apex angle of the paper's section 3.2. */
+METRO_API double metro_cone_startup_error(double half_angle, uint64_t n);
+METRO_API double metro_cone_startup_log_error(double half_angle, uint64_t n);
+
+/* The same for the von Mises-Fisher kernel of concentration `kappa`; kappa = 0 is the uniform direction. NaN when
+   kappa is negative or not finite. Cost: under 50 microseconds. */
+METRO_API double metro_vmf_startup_error(double kappa, uint64_t n);
+METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n);
+
+/* What a run makes of an integrand: the bias, the variance and the mean squared error bias^2 + variance of an
+   estimate. */
+typedef struct {
+    double bias, variance, mse;
+} metro_run_error;
+
+/* The exact error of the mean of f(z_burn), f(z_burn+1), .. f(z_burn+steps-1) as an estimate of the integral of f
+   over the circle, for a chain of constant importance with kernel `k`. The integrand is
+
+       f(x) = sum_{j=1}^{harmonics} (cosine_j cos(2 pi j x) + sine_j sin(2 pi j x))
+
+   with cosine[j - 1] and sine[j - 1]; a constant would change nothing. Either array may be NULL for all zeros. The
+   chain starts at seed[i] with probability alpha[i], i < `seeds` (`alpha` NULL: equal weights; weights as for
+   metro_startup_error_seeds); with `seeds` = 0 it starts from a uniform point. The mean over seeds of the square of
+   what each of them is off by is part of the mean squared error, so seeds that are off in different directions show
+   in the variance. steps = 0 asks for the limit of many steps: then the three numbers are the limits of steps * bias,
+   steps * variance and steps * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite,
+   seeds or weights that metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is
+   untouched then. Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0
+   is exactly 0. Cost: some 0.1 us for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
+   and 5 ns for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a pair. */
+METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
+                                               const double *cosine, const double *sine, size_t harmonics,
+                                               const double *seed, const double *alpha, size_t seeds,
+                                               metro_run_error *error);
+
+/* The size of a kernel of `shape` (METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN or METRO_CAUCHY, without large
+   steps) that gives the run described as above the least mean squared error, and that error. Sizes from 1/1024 to 8
+   are searched: the mean squared error has several minima, so they are scanned first and the best three refined.
+   Where many are equally good (wide kernels that are uniform to the last digit) it returns one of the smaller.
+   Errors: as metro_startup_run_error, and METRO_ERROR_ARGUMENT for another shape or `size` NULL; `size` and `error`
+   are untouched then. Cost: some 900 evaluations of the run's error. */
+METRO_API metro_result metro_startup_best_size(metro_shape shape, uint64_t burn, uint64_t steps, const double *cosine,
+                                               const double *sine, size_t harmonics, const double *seed,
+                                               const double *alpha, size_t seeds, double *size,
+                                               metro_run_error *error);
+
+/* # R6 The operator
+
+   Any importance on the circle, cut into cells, makes the chain a matrix; everything that a run will do, from any
+   seed, can then be computed and need not be simulated. */
+
+/* The chain on `cells` cells of the circle; cell i is [i/cells, (i+1)/cells). A cell is dark when its importance is
+   below 1e-300 of the whole: no chain enters it, and none may start there. Read the members, write none. */
+typedef struct {
+    size_t cells;
+    double *stationary;  /* [cells]: pi_i, the probability of cell i in equilibrium; 0 where dark; the sum is 1 */
+    double *transition;  /* [cells * cells]: P_ij at i * cells + j; each row sums to 1, the row of a dark cell is 0 */
+    double *rejection;   /* [cells]: r_i, the probability that a proposal from cell i is rejected; NaN where dark */
+    double acceptance;   /* the mean of 1 - r_i in equilibrium */
+} metro_operator;
+
+/* Makes the operator of `kernel`, whose shape must be METRO_UNIFORM (no figure needs another), for the importance of
+   each cell. `importance` holds `cells` numbers, not negative and finite, in any unit: only their ratios count. On
+   success free with metro_operator_free. Returns METRO_ERROR_ARGUMENT for another shape, an invalid kernel, no cells
+   or an importance that is negative, infinite or NaN; METRO_ERROR_NO_IMPORTANCE if all are 0; METRO_ERROR_MEMORY; on
+   failure `op` is unchanged. Costs cells^2 doubles and divisions. Source: eq 6.1 to eq 6.5. */
+METRO_API metro_result metro_operator_make(const metro_kernel *kernel, const double *importance, size_t cells,
+                                           metro_operator *op);
+
+/* Frees what metro_operator_make allocated. A zeroed operator may be freed. */
+METRO_API void metro_operator_free(metro_operator *op);
+
+/* Lets a distribution evolve: `mass` holds the probability of each cell before, and after `steps` steps in place. Any
+   finite numbers that are not negative will do. Returns METRO_ERROR_ARGUMENT for others, METRO_ERROR_DARK_SEED if a
+   dark cell has mass, METRO_ERROR_MEMORY; on failure `mass` is unchanged. Costs cells^2 multiplications a step for
+   the first 2 * cells steps, cells^3 for every doubling after that. Source: eq 6.6 and eq 6.7. */
+METRO_API metro_result metro_operator_evolve(const metro_operator *op, uint64_t steps, double *mass);
+
+/* How far a distribution is from equilibrium. */
+typedef struct {
+    double l2;               /* the norm of paper (10): sqrt(cells * sum (p_i - pi_i)^2) */
+    double chi;              /* sqrt(sum (p_i - pi_i)^2 / pi_i), eq 6.8 */
+    double total_variation;  /* sum abs(p_i - pi_i) / 2, eq 6.9: 0 .. 1 */
+    double divergence;       /* Kullback and Leibler's sum p_i ln(p_i / pi_i), eq 6.10 */
+} metro_distance;
+
+/* The distances of `mass`, the probabilities of the cells, from the stationary ones. All NaN when one is negative,
+   infinite or NaN, or their sum is off 1 by more than 1e-9. With mass in a dark cell `chi` and `divergence` are
+   infinite. */
+METRO_API metro_distance metro_operator_distance(const metro_operator *op, const double *mass);
+
+/* The probability that a chain which starts in `cell` had all of its first `steps` proposals rejected: the atom r^n
+   that the seed keeps (eq 6.11). NaN for a dark cell and beyond the last one. */
+METRO_API double metro_operator_atom(const metro_operator *op, size_t cell, uint64_t steps);
+
+/* What the eigenvalues say. They are real: 1 = lambda_1 >= lambda_2 >= ... >= -1. */
+typedef struct {
+    double gap;     /* 1 - lambda_2; to 12 digits even where lambda_2 rounds to 1 */
+    double second;  /* lambda_2: what survives of the slowest mode in a step */
+    double least;   /* the last one; below 0 a mode changes its sign in every step */
+} metro_spectrum;
+
+/* Finds all eigenvalues. `eigenvalue` (may be NULL) gets `cells` numbers in falling order, of which those that dark
+   cells leave over are NaN. `slowest` (may be NULL) gets the right eigenvector phi of lambda_2, scaled so that the
+   sum of pi_i phi_i^2 is 1, NaN in dark cells: for large n the p_n from seed i is near pi_j (1 + lambda_2^n phi_i
+   phi_j). Its sign is arbitrary. Where all cells but one are dark, gap, second, least and slowest are NaN. Returns
+   METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT if the operator holds a NaN that metro_operator_make did not put there;
+   then the outputs are unchanged. Cost: about 10 cells^3 multiplications. Eigenvalues are off by some 1e-15, the gap
+   by 1e-13 of itself or by 1e-25; where several gaps are below 1e-14, as on three islands, by no more than these
+   differ. Source: Golub and Van Loan (1996), algorithms 8.3.1 and 8.3.3; eq 6.12 to eq 6.14. */
+METRO_API metro_result metro_operator_spectrum(const metro_operator *op, double *eigenvalue, double *slowest,
+                                               metro_spectrum *spectrum);
+
+/* Errors of a run, averaged over its seed. */
+typedef struct {
+    double bias2;       /* seed drawn uniformly from the cells that are not dark: the mean of bias(seed)^2 */
+    double mse;         /* the same seeds: the mean squared error; the variance is mse - bias2 */
+    double stationary;  /* the mean squared error when the seed is drawn from the stationary distribution */
+} metro_operator_error;
+
+/* The exact error of the estimate (f(z_burn) + ... + f(z_{burn+steps-1})) / steps of the mean of f, where z_0 is the
+   seed, for every seed. `f` holds one value a cell. `bias` and `mse` (each may be NULL) get bias and mean squared
+   error for a start in each cell, NaN where dark; `mean` (may be NULL) the averages. Returns METRO_ERROR_ARGUMENT for
+   steps = 0 or an f that is not finite, METRO_ERROR_MEMORY; then the outputs are unchanged. Cost: 3 cells^2
+   multiplications a step for the first 2 * cells steps, 3 cells^3 for every doubling after that, and next to nothing
+   once the chain has forgotten its seed. Relative error: about 1e-16 over the spectral gap, or times `steps` if that
+   is less. Source: eq 6.15 to eq 6.20. */
+METRO_API metro_result metro_operator_run(const metro_operator *op, const double *f, uint64_t burn, uint64_t steps,
+                                          double *bias, double *mse, metro_operator_error *mean);
+
+/* The exponential importance I(x) = e^{-lambda x} under uniform perturbations of full width `size`, in closed form:
+   the transform that the paper proposes. All four give NaN unless lambda and size are positive and finite and s is
+   finite.
+
+   `transform`: phi(s) of eq 6.22: away from a border the Laplace transform of p_n is phi(s)^n e^{-s x0}, exactly so
+   for the first 2 x0 / size steps. `rejection`: the probability that a proposal is rejected, away from the border; at
+   a border it is this plus 1/2 if the border rejects, twice this if it reflects. `gap`: the upper bound of the
+   spectral gap on the half line x > 0, whose border reflects if `reflecting` is not 0 and otherwise rejects what
+   falls outside (eq 6.24, eq 6.25). `best_size`: where this bound is largest: 6.374497.../lambda and
+   9.171883.../lambda. */
+METRO_API double metro_exponential_transform(double lambda, double size, double s);
+METRO_API double metro_exponential_rejection(double lambda, double size);
+METRO_API double metro_exponential_gap(double lambda, double size, int reflecting);
+METRO_API double metro_exponential_best_size(double lambda, int reflecting);
+
+/* What metro_best_size should minimise the error of. Zero is the default. */
+typedef struct {
+    double (*integrand)(double x, void *user);  /* f; NULL: the picture of two pixels, 1 on [0, 1/2), else 0 */
+    const double *start;                        /* the seed x0 in [0, 1); NULL: the mean over uniformly drawn seeds */
+    uint64_t seed;                              /* of the jitter of the 64 points */
+} metro_best_options;
+
+/* The size to use and what to expect of it. */
+typedef struct {
+    double size;        /* full width of the uniform perturbation, .02 .. 2 */
+    double bias2;       /* predicted squared bias of the mean of f over the run (drawn seeds: its mean over them) */
+    double variance;    /* predicted variance; the mean squared error is bias2 + variance. Both are NaN if lit is 1 */
+    double acceptance;  /* predicted mean acceptance in equilibrium: for a look, not for tuning */
+    size_t lit;         /* how many of the 64 points are not dark: with a handful of them the prediction is a guess */
+    size_t refused;     /* how many were negative, infinite or NaN: dark to the chain, which rejects them */
+} metro_best;
+
+/* Chooses the size of the uniform perturbation for a run of `steps` steps on the circle under `importance`: the one
+   whose mean squared error is least, computed from the importance at 64 stratified points. The run's estimate is the
+   mean of f(z_1) .. f(z_steps): a step records the state it ends in, as metro_chain_run does, and the seed z_0 does
+   not count. `user` goes to `importance` and to the integrand; `options` may be NULL. Returns METRO_ERROR_ARGUMENT
+   for steps = 0, an integrand that is not finite where it is asked (or whose square is not), or a start outside [0,
+   1); METRO_ERROR_DARK_SEED or METRO_ERROR_BAD_SEED for a start of zero or of negative, infinite or NaN importance;
+   METRO_ERROR_NO_IMPORTANCE if all 64 points are dark; METRO_ERROR_MEMORY; on failure `best` is unchanged. Cost: 64
+   calls of each function and some 10 to 100 ms of arithmetic, whatever `steps`. A feature narrower than 1/64 is seen
+   by one point or by none, and the prediction is as good as the points. */
+METRO_API metro_result metro_best_size(double (*importance)(double x, void *user), void *user, uint64_t steps,
+                                       const metro_best_options *options, metro_best *best);
+
+/* # R7 Diagnostics
+
+   What are the draws of a chain worth? Draws are numbers that one or more chains produced, chain after chain: draw
+   `i` of chain `c` is `draw[c * draws + i]`, so `draw` holds `chains * draws` numbers. They may be anything one
+   measures along a chain: a coordinate, f/I, the luminance that falls on a block of pixels. All chains have the same
+   length, and a burn-in is left out by the caller. For states on a circle hand over cos 2 pi x and sin 2 pi x, since
+   the cut of the circle is no place of the space.
+
+   What cannot be said is NaN, and `metro_draws_trouble` says why. It is always NaN when a draw is not finite, when
+   all draws are equal, when there are no draws and when memory runs out. No function averages the chains before it
+   looks at them: the mean over chains that sit in different places looks like one chain that moves well. */
+
+/* The autocorrelation of one chain, rho[k] for the lags k = 0 .. lags - 1 (eq 7.3); rho[0] = 1. The estimate divides
+   by `draws`, not by draws - k, which bends far lags towards 0 and keeps their noise small. NaN throughout where it
+   cannot be said. Returns METRO_ERROR_ARGUMENT for a NULL, no lags, or more lags than draws, METRO_ERROR_MEMORY; then
+   `rho` is unchanged. Cost: draws log(draws), whatever the lags. */
+METRO_API metro_result metro_autocorrelation(const double *draw, size_t draws, size_t lags, double *rho);
+
+/* The variance of the mean of `steps` draws of a stationary chain, as a multiple of the variance of one draw (paper
+   (18) in its exact form, eq 7.1). rho[k] is the correlation at lag k, rho[0] = 1, and correlations from `lags` on
+   are taken to be 0. With covariances in place of correlations it is the variance itself. NaN for 0 steps or lags.
+   Cost: the smaller of lags and steps. */
+METRO_API double metro_bernstein(const double *rho, size_t lags, uint64_t steps);
+
+/* The integrated autocorrelation time tau: so many draws are worth one independent draw, when their mean is what we
+   want (eq 7.2). Estimated from all chains together by Geyer's initial monotone sequence (1992), on halves of chains
+   as in Vehtari et al. (2021), so that metro_ess_mean times tau is the number of draws; never below 1 / log10 of that
+   number. Chains that disagree make it long. NaN under six draws a chain. Cost: n log n for n draws in all, up to 90
+   bytes a draw. */
+METRO_API double metro_autocorrelation_time(const double *draw, size_t chains, size_t draws);
+
+/* The effective sample size: so many independent draws would tell as much. metro_ess is bulk ESS, which judges where
+   the bulk of the distribution lies and needs no mean or variance to exist; metro_ess_tail is the smaller of the
+   effective sample sizes of the quantiles at .05 and .95; metro_ess_mean belongs to the plain mean of the draws. A
+   middle draw of an odd number is left out. NaN under six draws a chain; the tail also when the quantile at .95 is
+   the largest draw, since then no draw lies beyond it. An antithetic chain is worth more than its draws, at most
+   log10 of their number times as much. Cost as metro_autocorrelation_time, and a sort. Source: Vehtari, Gelman,
+   Simpson, Carpenter and Buerkner (2021); the same numbers as their R package posterior. */
+METRO_API double metro_ess(const double *draw, size_t chains, size_t draws);
+METRO_API double metro_ess_tail(const double *draw, size_t chains, size_t draws);
+METRO_API double metro_ess_mean(const double *draw, size_t chains, size_t draws);
+
+/* R-hat, how much chains and their halves disagree: 1 when they look alike, and below 1.01 for results one trusts. It
+   takes the larger of two values, on ranks of the draws (do the chains sit in the same place?) and on ranks of their
+   distances from the median (are they as wide?). +INFINITY when every chain stands still and not all at the same
+   place. NaN under four draws a chain, or when all draws are equally far from the median. It compares chains with
+   each other, never with the truth: where no chain has been, it knows nothing. Cost: three sorts. Source: Vehtari et
+   al. (2021), rank-normalised split R-hat; the same numbers as posterior. */
+METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws);
+
+/* The Monte Carlo standard error of the mean of all draws, and of their standard deviation: the deviation of the
+   draws over the root of the effective sample size (eq 7.8, eq 7.9). NaN where that size is NaN; the second also when
+   all draws are equally far from their mean. Source: Vehtari et al. (2021), as in posterior. */
+METRO_API double metro_mcse_mean(const double *draw, size_t chains, size_t draws);
+METRO_API double metro_mcse_sd(const double *draw, size_t chains, size_t draws);
+
+/* Why a diagnostic of these draws is NaN or not to be trusted, as a sentence, or NULL when nothing is wrong that the
+   draws could show. It names the first it finds of: no draws, a draw that is not finite, fewer than four draws a
+   chain, all draws equal, chains that all stand still, one that does, fewer than six draws, R-hat that cannot be
+   said, chains shorter than 50 autocorrelation times, R-hat above 1.1, and memory that ran out. The string is
+   constant. Cost: that of metro_rhat and metro_ess_mean. */
+METRO_API const char *metro_draws_trouble(const double *draw, size_t chains, size_t draws);
+
+/* The mean squared distance between a draw of one chain and the next (eq 7.12), stays included: on a circle of length
+   `period`, or on the line when `period` is 0. NaN under two draws, for a draw that is not finite, and for a period
+   that is negative, infinite or NaN. */
+METRO_API double metro_squared_jump(const double *draw, size_t draws, double period);
+
+/* How wrong a method is, from repeats of the same run with other random numbers. All are means over the values. */
+typedef struct {
+    double bias2, bias2_error;       /* squared bias: unbiased, hence at times negative */
+    double variance, variance_error; /* of one run */
+    double mse, mse_error;           /* mean squared error of one run; the sum of the two */
+} metro_bias_variance;
+
+/* Takes bias and variance of an estimate apart (eq 7.13, eq 7.14). `estimate` holds repeats * values numbers: all
+   values (the samples of a picture, say) of the first run, then of the second; `truth` holds the true values. The
+   errors are standard errors by the jackknife over runs, so that the values of one run may depend on each other;
+   where there is no bias, `bias2_error` is too large by sqrt(2 (repeats - 1)/(repeats - 2)). Under two repeats bias^2
+   and variance are NaN, under three so are their errors, and under two the error of the mean squared error. NaN or an
+   infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or a
+   NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
+   Source: Quenouille (1956), Efron and Stein (1981). */
+METRO_API metro_result metro_repeats(const double *estimate, const double *truth, size_t repeats, size_t values,
+                                     metro_bias_variance *out);
+
+/* The outcome of a check of detailed balance. `probability` is the chance that a correct transition scores
+   `chi_square` or more: under 1e-6 the transition is wrong. */
+typedef struct {
+    double chi_square, freedom, probability;
+    size_t coordinate;  /* of the state, the one that scores worst */
+    size_t from, to;    /* the two cells of that coordinate between which the flows differ most */
+    double excess;      /* the flow from -> to less the flow back, as a part of their sum, -1 .. 1 */
+} metro_balance;
+
+/* Tests a transition against the target that it should leave in balance (eq 7.15). `step` writes the state after
+   `from` to `to`; NULL means a step of metro_chain with the target's own proposal or kernels, which tests a proposal
+   and its ratio. `draws` uniform states are drawn, each is kept with the probability that its importance is of the
+   largest one, and steps once; each coordinate is cut into `cells` cells (2 to 256; 0 means 16; finer than the
+   perturbation is best). Returns METRO_ERROR_ARGUMENT, METRO_ERROR_MEMORY, or METRO_ERROR_NO_IMPORTANCE if no two
+   cells were connected by 20 pairs; then `balance` is untouched. Costs up to 3 importances and one step a draw; some
+   1e6 draws serve. Source: Bowker (1948) for the statistic, Wilson and Hilferty (1931) for its probability. */
+METRO_API metro_result metro_balance_check(const metro_target *target,
+                                           void (*step)(const double *from, double *to, metro_rng *rng, void *user),
+                                           uint64_t draws, size_t cells, metro_rng rng, metro_balance *balance);
+
+/* An ensemble of independent chains, looked at after given numbers of steps. Zero is the default where one is named.
+   */
+typedef struct {
+    const metro_target *target;          /* circles and intervals; importance and propose are called from several
+                                            threads, record is not called */
+    const metro_chain_options *options;  /* NULL for the defaults */
+    const double *seed, *alpha;          /* `seeds` states and their probabilities, as in metro_chain_start_seeds */
+    size_t seeds;
+    const uint64_t *steps;               /* [times], increasing: when to look */
+    size_t times;
+    uint64_t chains;                     /* rounded up to a multiple of the jobs */
+    size_t harmonics;                    /* K: the highest harmonic along each axis */
+    uint64_t random_seed;
+    size_t jobs;                         /* independent groups, at least 4; 0 means 64 */
+    size_t threads;                      /* 0 means one a core; the answer does not depend on it */
+} metro_ensemble;
+
+/* Measures E_n^2, the squared L2 distance between p_n and the uniform density, over the harmonics up to K along each
+   axis, from empirical Fourier coefficients (eq 7.17): no bins, no smoothing. squared[i] is an unbiased estimate
+   after steps[i] steps and may be negative where E_n is small; error[i] is its standard error (eq 7.18). Both have
+   `times` values. What lies beyond K is not in the sum: for a uniform perturbation and n = 1 it is about 2/(pi^2
+   Delta^2 K), for larger n far less. Returns the errors of the chain, METRO_ERROR_ARGUMENT also for an axis that is a
+   direction, for over 2^20 modes or fewer than 4 jobs; then the outputs are untouched. Costs chains * (last step +
+   times * axes * modes). */
+METRO_API metro_result metro_ensemble_measure(const metro_ensemble *ensemble, double *squared, double *error);
+
+/* # R8 Pictures
+
+   A picture is a block of numbers: linear radiance, with no exposure, gamma or clamp. Grey pictures have one channel,
+   colour pictures three (red, green, blue). Row 0 is the top row, and channel `c` of the pixel in column `x` of row
+   `y` is `value[(y * width + x) * channels + c]`. */
+typedef struct {
+    size_t width, height, channels;
+    double *value;
+} metro_image;
+
+/* Makes a black picture of `width` x `height` pixels with `channels` = 1 or 3, to be given back by
+   `metro_image_free`. An `image` that holds a picture is not freed first. Returns METRO_ERROR_ARGUMENT when a size is
+   0, `channels` is neither 1 nor 3 or `image` is NULL, METRO_ERROR_MEMORY when there is no room (or the size
+   overflows); then `image` is unchanged. Cost: 8 bytes a sample. */
+METRO_API metro_result metro_image_make(size_t width, size_t height, size_t channels, metro_image *image);
+
+/* Gives the memory back and leaves the empty picture, all zeros; the empty picture and NULL are allowed. */
+METRO_API void metro_image_free(metro_image *image);
+
+/* Reads the picture in the file `path` into `image`, which is then the caller's to free; an `image` that holds a
+   picture is not freed first. The first bytes decide: `P6` and `P3` are PPM, whose values are taken through the sRGB
+   curve into 0 .. 1 (maxval 1 to 65535, comments allowed); `PF` and `Pf` are PFM in colour and grey, in either byte
+   order, NaN and infinity kept, each value times the magnitude of the scale in the header. Returns METRO_OK,
+   METRO_ERROR_FILE when the file cannot be read, METRO_ERROR_FORMAT when it is not what it claims to be (more or
+   fewer pixels than it says included), METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT (a NULL). Then `image` is
+   unchanged, nothing stays allocated, and `message` says what is wrong and what to do, cut to `message_size` bytes
+   with its closing zero; on success it is empty. `message` may be NULL when `message_size` is 0. Cost: a file that is
+   refused costs at most its own size in memory, a good one 8 bytes a sample besides; time is linear. Source: netpbm's
+   description of PPM; Debevec's of PFM. */
+METRO_API metro_result metro_image_load(const char *path, metro_image *image, char *message, size_t message_size);
+
+/* The same from the `size` bytes at `bytes`. Nothing is allocated before the whole file has been found good. */
+METRO_API metro_result metro_image_parse(const unsigned char *bytes, size_t size, metro_image *image, char *message,
+                                         size_t message_size);
+
+/* Writes `image` as PFM: 32-bit floats, little endian (scale -1.0), rows from bottom to top, `PF` for three channels
+   and `Pf` for one. NaN and infinity are kept; a magnitude beyond what a float holds (3.4e38) becomes infinity. The
+   bytes are the same on every machine and in every locale. The file appears whole or not at all: it is written as
+   `path` with `.tmp` appended (a file of that name is replaced) and renamed when all of it has arrived. What is there
+   already and is no ordinary file, /dev/stdout for one, is written directly. Returns METRO_ERROR_FILE when it cannot
+   be written, and then an older file at `path` is as it was, METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT (an empty
+   picture, `channels` not 1 or 3, a NULL). */
+METRO_API metro_result metro_image_save_pfm(const metro_image *image, const char *path);
+
+/* The same as PPM: P6 with 8 bits a channel through the sRGB curve, rounded to nearest; grey is written as three
+   equal channels. 1, everything above and +infinity become 255; 0, everything below and NaN become 0, and
+   `metro_image_not_finite` says how many samples were no number to show. */
+METRO_API metro_result metro_image_save_ppm(const metro_image *image, const char *path);
+
+/* How many samples are NaN or infinite; 0 for the empty picture. */
+METRO_API size_t metro_image_not_finite(const metro_image *image);
+
+/* The luminance of linear sRGB, eq 8.1. */
+METRO_API double metro_luminance(double red, double green, double blue);
+
+/* The sRGB curve from linear 0 .. 1 to encoded 0 .. 1, eq 8.2, and back, eq 8.3. No clamp: the curves go on beyond 0
+   and 1, and NaN gives NaN. Source: IEC 61966-2-1:1999. */
+METRO_API double metro_srgb_encode(double linear);
+METRO_API double metro_srgb_decode(double encoded);
+
+/* How far a picture is from its reference. */
+typedef struct {
+    double relative_rmse;  /* eq 8.4, over all samples */
+    double relmse;         /* eq 8.5, on luminance */
+    double mean;           /* mean luminance of the picture */
+    double mean_reference; /* and of the reference */
+    double largest;        /* the largest absolute difference of a sample, */
+    size_t x, y;           /* and the first pixel that has it */
+} metro_image_difference;
+
+/* Compares `image` with `reference`, which has the same size and channels. A NaN or an infinity in either picture
+   makes the sums NaN or infinite, as it must; one NaN and `largest` is NaN and names its pixel. A black reference
+   gives infinity, or NaN where the picture is black too. Returns METRO_ERROR_ARGUMENT when the pictures differ in
+   shape, are empty or NULL, and then `difference` is unchanged. Cost: some 20 ns a pixel. */
+METRO_API metro_result metro_image_error(const metro_image *image, const metro_image *reference,
+                                         metro_image_difference *difference);
+
+/* The part of `relmse` that the reference's own noise makes, eq 8.6: subtract it. `variance` holds the variance of
+   the reference's luminance in each pixel, in one channel or the same in three. Returns METRO_ERROR_ARGUMENT when the
+   sizes differ or a picture is empty or NULL, and then `relmse` is unchanged. */
+METRO_API metro_result metro_image_noise(const metro_image *reference, const metro_image *variance, double *relmse);
+
+#ifdef __cplusplus
+}
+#endif
+#endif /* METRO_H */
+#if defined(METRO_IMPLEMENTATION) && !defined(METRO_IMPLEMENTED)
+#define METRO_IMPLEMENTED
+#include <errno.h>
+#include <math.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#ifndef METRO_NO_THREADS
+#ifdef _WIN32
+#define METRO_NO_THREADS
+#else
+#include <pthread.h>
+#include <unistd.h>
+#endif
+#endif
+#ifndef METRO_MALLOC
+#define METRO_MALLOC(size) malloc(size)
+#define METRO_REALLOC(pointer, size) realloc(pointer, size)
+#define METRO_FREE(pointer) free(pointer)
+#endif
+#ifndef METRO_ASSERT
+#include <assert.h>
+#define METRO_ASSERT(condition) assert(condition)
+#endif
+#define METROI_PI 3.14159265358979323846
+#define METROI_NAN ((double)NAN)
+#define METROI_INFINITY ((double)INFINITY)
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* # 1 Ground
+
+   Everything above stands on three small things: a way to say that something failed, vectors, and a way to use many
+   cores without the answer depending on how many there are. */
+
+/* # 1.1 Results
+
+   A result is a number for the program and a sentence for the person. The sentence says what to do, because whoever
+   reads it is usually in the middle of something else. */
+
+METRO_API const char *metro_result_text(metro_result result)
+{
+    switch (result) {
+    case METRO_OK: return "success";
+    case METRO_ERROR_ARGUMENT: return "an argument is outside its range; see the contract of the function in metro.h";
+    case METRO_ERROR_MEMORY: return "out of memory; use a smaller size or fewer chains";
+    case METRO_ERROR_FILE: return "the file cannot be opened, read or written; check its path and permissions";
+    case METRO_ERROR_FORMAT: return "the file is damaged or of another kind than its name or first bytes say";
+    case METRO_ERROR_DARK_SEED: return "a seed has zero importance; start where the importance is positive";
+    case METRO_ERROR_BAD_SEED:
+        return "the importance of a seed is negative, infinite or NaN; check the importance function";
+    case METRO_ERROR_NO_IMPORTANCE:
+        return "no candidate has positive importance; try more candidates or check the importance function";
+    case METRO_ERROR_STOPPED: return "the run was stopped early; the result so far stands";
+    }
+    return "unknown result";
+}
+
+/* # 1.2 Vectors
+
+   Directions carry the light in the later chapters and are states of a chain in this one. A vector is three doubles,
+   passed by value. */
+
+METRO_API metro_vec3 metro_vec3_make(double x, double y, double z)
+{
+    metro_vec3 v;
+    v.x = x;
+    v.y = y;
+    v.z = z;
+    return v;
+}
+
+METRO_API metro_vec3 metro_add(metro_vec3 a, metro_vec3 b)
+{
+    return metro_vec3_make(a.x + b.x, a.y + b.y, a.z + b.z);
+}
+
+METRO_API metro_vec3 metro_subtract(metro_vec3 a, metro_vec3 b)
+{
+    return metro_vec3_make(a.x - b.x, a.y - b.y, a.z - b.z);
+}
+
+METRO_API metro_vec3 metro_scale(metro_vec3 a, double factor)
+{
+    return metro_vec3_make(a.x * factor, a.y * factor, a.z * factor);
+}
+
+METRO_API metro_vec3 metro_cross(metro_vec3 a, metro_vec3 b)
+{
+    return metro_vec3_make(a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x);
+}
+
+METRO_API double metro_dot(metro_vec3 a, metro_vec3 b)
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+/* A length squares its components, and 1e-300 squared is 0. So we divide by the largest component first. */
+
+static double metroi_largest_component(metro_vec3 a)
+{
+    double x = fabs(a.x), y = fabs(a.y), z = fabs(a.z);
+    double largest = x > y ? x : y;
+    return largest > z ? largest : z;
+}
+
+METRO_API double metro_length(metro_vec3 a)
+{
+    double largest = metroi_largest_component(a);
+    metro_vec3 scaled;
+    if (!(largest > 0) || isinf(largest)) return fabs(a.x) + fabs(a.y) + fabs(a.z);
+    scaled = metro_vec3_make(a.x / largest, a.y / largest, a.z / largest);
+    return largest * sqrt(metro_dot(scaled, scaled));
+}
+
+METRO_API metro_vec3 metro_normalize(metro_vec3 a)
+{
+    double largest = metroi_largest_component(a);
+    metro_vec3 scaled;
+    if (!(largest > 0) || isinf(largest)) return metro_vec3_make(METROI_NAN, METROI_NAN, METROI_NAN);
+    scaled = metro_vec3_make(a.x / largest, a.y / largest, a.z / largest);
+    return metro_scale(scaled, 1.0 / sqrt(metro_dot(scaled, scaled)));
+}
+
+/* # 1.3 Rounds of jobs
+
+   A run on many cores usually gives another picture each time, because threads add to the same sums in the order in
+   which they happen to arrive, and floating-point addition is not associative. We separate the two: threads take jobs
+   in any order and each writes to the slot of its job; when the round is over, one thread takes the slots in the
+   order of jobs. What remains of the machine is only how long it took.
+
+   A pool is shared by the threads of one round. The lock covers the number of the next job and nothing else. */
+
+typedef struct {
+    const metro_rounds *plan;
+    void *user;
+    unsigned char *slots;     /* jobs * slot_size bytes */
+    metro_result *results;    /* one a job */
+    uint64_t first_job;
+    size_t jobs, next;
+#ifndef METRO_NO_THREADS
+    pthread_mutex_t lock;
+#endif
+} metroi_pool;
+
+/* Hands out the next job of the round, or `jobs` when all are taken. */
+static size_t metroi_pool_take(metroi_pool *pool)
+{
+    size_t job;
+#ifndef METRO_NO_THREADS
+    pthread_mutex_lock(&pool->lock);
+#endif
+    job = pool->next;
+    if (pool->next < pool->jobs) pool->next++;
+#ifndef METRO_NO_THREADS
+    pthread_mutex_unlock(&pool->lock);
+#endif
+    return job;
+}
+
+/* What each thread does: jobs, until none is left. */
+static void *metroi_pool_work(void *argument)
+{
+    metroi_pool *pool = (metroi_pool *)argument;
+    size_t job;
+    while ((job = metroi_pool_take(pool)) < pool->jobs) {
+        void *slot = pool->slots + job * pool->plan->slot_size;
+        pool->results[job] = pool->plan->work(pool->first_job + job, slot, pool->user);
+    }
+    return NULL;
+}
+
+/* Does all jobs of a round on `threads` threads, of which the caller is one. A thread that cannot be created is not
+   missed: the others take its jobs. */
+#ifdef METRO_NO_THREADS
+static void metroi_pool_round(metroi_pool *pool, size_t threads)
+{
+    (void)threads;
+    metroi_pool_work(pool);
+}
+#else
+static void metroi_pool_round(metroi_pool *pool, size_t threads)
+{
+    enum { MOST = 256 };
+    pthread_t helper[MOST];
+    size_t started = 0, i;
+    if (threads > pool->jobs) threads = pool->jobs;
+    while (started + 1 < threads && started < MOST) {
+        if (pthread_create(&helper[started], NULL, metroi_pool_work, pool) != 0) break;
+        started++;
+    }
+    metroi_pool_work(pool);
+    for (i = 0; i < started; i++) pthread_join(helper[i], NULL);
+}
+#endif
+
+/* The first failure in the order of jobs decides; otherwise all slots are merged in that order. */
+static metro_result metroi_pool_merge(const metroi_pool *pool)
+{
+    size_t job;
+    for (job = 0; job < pool->jobs; job++)
+        if (pool->results[job] != METRO_OK) return pool->results[job];
+    for (job = 0; pool->plan->merge != NULL && job < pool->jobs; job++) {
+        const void *slot = pool->slots + job * pool->plan->slot_size;
+        metro_result result = pool->plan->merge(pool->first_job + job, slot, pool->user);
+        if (result != METRO_OK) return result;
+    }
+    return METRO_OK;
+}
+
+static metro_result metroi_pool_rounds(metroi_pool *pool, uint64_t rounds, size_t threads)
+{
+    const metro_rounds *plan = pool->plan;
+    uint64_t round;
+    for (round = 0; round < rounds; round++) {
+        metro_result result;
+        pool->first_job = (plan->first_round + round) * pool->jobs;
+        pool->next = 0;
+        if (plan->slot_size > 0) memset(pool->slots, 0, pool->jobs * plan->slot_size);
+        metroi_pool_round(pool, threads);
+        result = metroi_pool_merge(pool);
+        if (result != METRO_OK) return result;
+        if (plan->stop != NULL && plan->stop(round + 1, pool->user)) return METRO_ERROR_STOPPED;
+    }
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_rounds_run(const metro_rounds *plan, void *user)
+{
+    metroi_pool pool;
+    metro_result result;
+    size_t threads = plan->threads > 0 ? plan->threads : metro_core_count();
+    memset(&pool, 0, sizeof pool);
+    pool.plan = plan;
+    pool.user = user;
+    pool.jobs = plan->jobs > 0 ? plan->jobs : 16;
+    if (plan->work == NULL || pool.jobs > SIZE_MAX / sizeof *pool.results) return METRO_ERROR_ARGUMENT;
+    if (plan->slot_size > (SIZE_MAX - 1) / pool.jobs) return METRO_ERROR_ARGUMENT;
+    pool.slots = (unsigned char *)METRO_MALLOC(pool.jobs * plan->slot_size + 1);
+    pool.results = (metro_result *)METRO_MALLOC(pool.jobs * sizeof *pool.results);
+    result = METRO_ERROR_MEMORY;
+#ifndef METRO_NO_THREADS
+    if (pool.slots != NULL && pool.results != NULL && pthread_mutex_init(&pool.lock, NULL) == 0) {
+        result = metroi_pool_rounds(&pool, plan->rounds > 0 ? plan->rounds : 1, threads);
+        pthread_mutex_destroy(&pool.lock);
+    }
+#else
+    if (pool.slots != NULL && pool.results != NULL)
+        result = metroi_pool_rounds(&pool, plan->rounds > 0 ? plan->rounds : 1, threads);
+#endif
+    METRO_FREE(pool.results);
+    METRO_FREE(pool.slots);
+    return result;
+}
+
+METRO_API size_t metro_core_count(void)
+{
+#if !defined(METRO_NO_THREADS) && defined(_SC_NPROCESSORS_ONLN)
+    long cores = sysconf(_SC_NPROCESSORS_ONLN);
+    return cores > 0 ? (size_t)cores : 1;
+#else
+    return 1;
+#endif
+}
+
+/* # 2 Randomness
+
+   A Markov chain is made of random numbers, so their quality and their bookkeeping come first. Each chain, job and
+   experiment owns a stream that follows from a seed and a number; nothing is shared, nothing is hidden, and a result
+   can be repeated from the two numbers alone. */
+
+/* # 2.1 Streams
+
+   The generator is xoshiro256++ (Blackman and Vigna 2021): 256 bits of state $s_0 .. s_3$, a linear recurrence over
+   bits, and a sum and a rotation that hide its linearity. Its period is 2^256 - 1, so streams that start at unrelated
+   places do not meet. To get unrelated places from neighbouring numbers (seed 1, stream 0; seed 1, stream 1) we fill
+   the state from two sequences of SplitMix64 (Steele, Lea and Flood 2014) and mix what they give once more. */
+
+static uint64_t metroi_mix(uint64_t x)
+{
+    x = (x ^ (x >> 30)) * UINT64_C(0xbf58476d1ce4e5b9);
+    x = (x ^ (x >> 27)) * UINT64_C(0x94d049bb133111eb);
+    return x ^ (x >> 31);
+}
+
+static uint64_t metroi_rotate(uint64_t x, int bits)
+{
+    return (x << bits) | (x >> (64 - bits));
+}
+
+METRO_API metro_rng metro_rng_make(uint64_t seed, uint64_t stream)
+{
+    const uint64_t golden = UINT64_C(0x9e3779b97f4a7c15); /* 2^64 over the golden ratio: SplitMix64's step */
+    metro_rng rng;
+    uint64_t i;
+    for (i = 0; i < 4; i++) {
+        uint64_t a = metroi_mix(seed + (i + 1) * golden);
+        uint64_t b = metroi_mix(metroi_mix(stream ^ golden) + (i + 1) * golden);
+        rng.state[i] = metroi_mix(a + metroi_rotate(b, 32));
+    }
+    /* The one forbidden state is all zeros. */
+    if ((rng.state[0] | rng.state[1] | rng.state[2] | rng.state[3]) == 0) rng.state[0] = golden;
+    return rng;
+}
+
+METRO_API uint64_t metro_rng_next(metro_rng *rng)
+{
+    uint64_t *s = rng->state;
+    uint64_t result = metroi_rotate(s[0] + s[3], 23) + s[0];
+    uint64_t t = s[1] << 17;
+    s[2] ^= s[0];
+    s[3] ^= s[1];
+    s[1] ^= s[2];
+    s[0] ^= s[3];
+    s[2] ^= t;
+    s[3] = metroi_rotate(s[3], 45);
+    return result;
+}
+
+/* Of the 64 bits a double holds 53. The upper ones are the better ones. */
+
+METRO_API double metro_rng_uniform(metro_rng *rng)
+{
+    return (double)(metro_rng_next(rng) >> 11) * (1.0 / 9007199254740992.0);
+}
+
+/* The remainder of a division by `bound` favours small numbers by one part in 2^64 / bound. Lemire (2019) takes the
+   high half of a product instead and draws again in the rare case that the low half falls into the uneven rest. The
+   128-bit product is put together from halves, so that no compiler needs such a type. */
+
+static uint64_t metroi_multiply_high(uint64_t a, uint64_t b, uint64_t *low)
+{
+    uint64_t a0 = a & 0xffffffffu, a1 = a >> 32, b0 = b & 0xffffffffu, b1 = b >> 32;
+    uint64_t middle = a1 * b0 + ((a0 * b0) >> 32);
+    uint64_t middle2 = a0 * b1 + (middle & 0xffffffffu);
+    *low = a * b;
+    return a1 * b1 + (middle >> 32) + (middle2 >> 32);
+}
+
+METRO_API uint64_t metro_rng_below(metro_rng *rng, uint64_t bound)
+{
+    uint64_t low, high, uneven;
+    if (bound == 0) return 0;
+    uneven = (0 - bound) % bound;
+    do high = metroi_multiply_high(metro_rng_next(rng), bound, &low);
+    while (low < uneven);
+    return high;
+}
+
+/* A point of the plane with two independent normal coordinates has a uniform angle and a radius $r$ with
+   P(radius > r) = e^{-r^2/2} (Box and Muller 1958). The first uniform is turned round, so that the logarithm
+   never sees a 0. */
+
+METRO_API double metro_rng_normal(metro_rng *rng)
+{
+    double radius = sqrt(-2.0 * log(1.0 - metro_rng_uniform(rng)));
+    return radius * cos(2.0 * METROI_PI * metro_rng_uniform(rng));
+}
+
+METRO_API metro_vec3 metro_rng_direction(metro_rng *rng)
+{
+    double z = 1.0 - 2.0 * metro_rng_uniform(rng);
+    double azimuth = 2.0 * METROI_PI * metro_rng_uniform(rng);
+    double r = sqrt((1.0 - z) * (1.0 + z));
+    return metro_vec3_make(r * cos(azimuth), r * sin(azimuth), z);
+}
+
+/* # 2.2 Sums and moments
+
+   After 2^32 steps a plain running sum has forgotten the last digits of each new term. Neumaier (1974) carries the
+   rounding error of each addition along and adds it at the end. */
+
+METRO_API void metro_sum_add(metro_sum *sum, double term)
+{
+    double total = sum->sum + term;
+    double rest = fabs(sum->sum) >= fabs(term) ? (sum->sum - total) + term : (term - total) + sum->sum;
+    sum->sum = total;
+    sum->lost += rest;
+}
+
+METRO_API double metro_sum_value(const metro_sum *sum)
+{
+    return isfinite(sum->lost) ? sum->sum + sum->lost : sum->sum;
+}
+
+/* Importances span hundreds of decades, and the square of 1e200 is no double. So the moments are kept in units of
+   the largest magnitude seen; the updates are Welford's (1962):
+
+       m_n = m_{n-1} + frac{x - m_{n-1}}{n},    Q_n = Q_{n-1} + (x - m_{n-1}) (x - m_n)                      (2.1) */
+
+METRO_API void metro_moments_add(metro_moments *moments, double value)
+{
+    double magnitude = fabs(value), x, deviation;
+    if (magnitude > moments->scale) {
+        double shrink = moments->scale / magnitude;
+        moments->mean *= shrink;
+        moments->squares *= shrink * shrink;
+        moments->scale = magnitude;
+    }
+    x = moments->scale > 0 ? value / moments->scale : value;
+    moments->count++;
+    deviation = x - moments->mean;
+    moments->mean += deviation / (double)moments->count; /* eq 2.1 */
+    moments->squares += deviation * (x - moments->mean); /* eq 2.1 */
+}
+
+METRO_API double metro_moments_mean(const metro_moments *moments)
+{
+    return moments->count > 0 ? moments->mean * (moments->scale > 0 ? moments->scale : 1.0) : METROI_NAN;
+}
+
+METRO_API double metro_moments_variance(const metro_moments *moments)
+{
+    double scale = moments->scale > 0 ? moments->scale : 1.0;
+    if (moments->count < 2) return METROI_NAN;
+    return moments->squares / (double)(moments->count - 1) * scale * scale;
+}
+
+METRO_API double metro_moments_error(const metro_moments *moments)
+{
+    double n = (double)moments->count, scale = moments->scale > 0 ? moments->scale : 1.0;
+    return moments->count < 2 ? METROI_NAN : sqrt(moments->squares / (n - 1.0) / n) * scale;
+}
+
+/* # 2.3 Points that fill the cube evenly
+
+   Random points clump: of $N$ points in $N$ cells of equal size more than a third of the cells stay empty. A sequence
+   that puts exactly one into each cell, for many ways of cutting the cube into cells, integrates smooth functions
+   with an error that falls almost as $1/N$, and shuffled as below almost as $N^{-3/2}$, where random points have
+   $N^{-1/2}$. Sobol (1967) found one that needs only binary digits. The digits of the number of the point, $n_1$ the
+   lowest, choose which direction numbers $v_j$ are added up, digit by digit modulo 2:
+
+       x = sum_{j=1}^{24} n_j v_j,   v_j = frac{m_j}{2^j}                             (2.2)
+
+   Each coordinate has its own odd integers $m_j < 2^j$. A primitive polynomial of degree $s$ with the coefficients
+   $a_1 .. a_{s-1}$ continues the first $s$ of them, again modulo 2:
+
+       m_j = 2 a_1 m_{j-1} + 4 a_2 m_{j-2} + ... + 2^{s-1} a_{s-1} m_{j-s+1} + 2^s m_{j-s} + m_{j-s}          (2.3)
+
+   Because $m_j$ is odd, $v_j$ is the first of them whose digits reach place $j$, so any $2^k$ points in a row from a
+   multiple of $2^k$ have different first $k$ digits: one point in each interval of length $2^{-k}$. How evenly pairs
+   of coordinates fill the plane depends on the first integers. Joe and Kuo (2008) searched for good ones; the table
+   holds the first 32 coordinates of their list `new-joe-kuo-6`, each row continued by eq 2.3. The first coordinate
+   is the number of the point with its digits mirrored about the binary point. */
+
+#define METROI_SOBOL_DIGITS 24
+
+/* The first 24 digits of a coordinate as a whole number. */
+static uint32_t metroi_sobol_digits(uint32_t index, unsigned dimension)
+{
+    static const uint32_t m[32][METROI_SOBOL_DIGITS] = {
+        { 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1 },
+        { 1, 3, 5, 15, 17, 51, 85, 255, 257, 771, 1285, 3855, 4369, 13107, 21845, 65535, 65537, 196611, 327685,
+          983055, 1114129, 3342387, 5570645, 16711935 },
+        { 1, 3, 3, 9, 29, 23, 71, 197, 209, 627, 1907, 1369, 4109, 12327, 12407, 36949, 119041, 94979, 291587, 809225,
+          855325, 2565911, 7829319, 5592517 },
+        { 1, 3, 1, 5, 31, 29, 81, 147, 433, 149, 719, 3693, 3841, 11523, 16641, 49925, 16671, 83229, 515921, 482707,
+          1314993, 2380693, 7205839, 2481005 },
+        { 1, 1, 1, 11, 31, 55, 61, 157, 181, 191, 1291, 3851, 6993, 7153, 16561, 16571, 17679, 184103, 514861, 908077,
+          983109, 2556623, 2951131, 2952667 },
+        { 1, 1, 3, 3, 25, 9, 43, 251, 449, 449, 1347, 323, 5081, 14281, 23403, 35771, 36865, 102401, 110595, 831491,
+          331801, 1380361, 8335403, 15675643 },
+        { 1, 3, 5, 13, 11, 37, 31, 227, 381, 143, 241, 3889, 2255, 6625, 15395, 33895, 101617, 171539, 442933, 345725,
+          1298203, 844053, 7545679, 12019507 },
+        { 1, 1, 5, 5, 17, 9, 9, 45, 237, 633, 65, 1601, 5701, 8005, 32593, 47689, 13385, 74861, 402861, 931641,
+          2019329, 3641345, 5509125, 3411973 },
+        { 1, 1, 5, 5, 5, 53, 53, 113, 113, 353, 1873, 785, 4885, 533, 24853, 58661, 124261, 124193, 513313, 775985,
+          201985, 1185025, 3216645, 11871493 },
+        { 1, 1, 7, 11, 19, 37, 69, 91, 103, 871, 913, 1009, 6199, 10683, 10691, 10741, 5237, 27819, 433303, 434167,
+          1918721, 2804481, 2478855, 16639243 },
+        { 1, 1, 5, 1, 1, 27, 79, 35, 175, 695, 1021, 2333, 2353, 13237, 17413, 11279, 31771, 52319, 195971, 794507,
+          1847729, 2930161, 985141, 6498481 },
+        { 1, 1, 1, 3, 11, 43, 75, 43, 425, 37, 1813, 1317, 2501, 12743, 12623, 4711, 56359, 253127, 120005, 779337,
+          2033521, 3607409, 7799633, 12002195 },
+        { 1, 3, 5, 5, 31, 35, 113, 51, 31, 133, 1197, 1511, 6913, 1801, 23819, 61239, 11021, 162239, 245979, 312137,
+          541137, 1622771, 8115893, 11367317 },
+        { 1, 3, 3, 9, 7, 49, 33, 163, 483, 681, 2023, 2129, 7169, 5123, 11267, 21513, 62471, 105521, 367649, 38051,
+          110051, 775849, 947175, 13964369 },
+        { 1, 1, 1, 15, 21, 21, 77, 157, 61, 371, 1001, 2257, 1169, 7281, 30161, 30175, 55109, 55109, 154909, 810285,
+          1864749, 2389731, 3987321, 843585 },
+        { 1, 3, 1, 13, 27, 49, 35, 133, 331, 475, 1389, 1707, 1461, 10927, 1749, 31409, 109391, 195317, 302367,
+          244561, 443703, 1268895, 5095857, 2606295 },
+        { 1, 1, 1, 15, 7, 5, 123, 103, 287, 321, 1109, 255, 597, 11005, 32341, 10491, 96851, 12009, 159799, 209091,
+          733379, 3265357, 2004569, 4960971 },
+        { 1, 3, 1, 15, 13, 25, 27, 109, 131, 897, 1687, 2495, 413, 5311, 11701, 12211, 81945, 49173, 147519, 606457,
+          770111, 148389, 3917099, 9257323 },
+        { 1, 1, 5, 5, 19, 61, 87, 187, 463, 599, 225, 3331, 7029, 5501, 32705, 8641, 9287, 60649, 336219, 213775,
+          636115, 1228027, 1507869, 16452127 },
+        { 1, 3, 7, 11, 23, 15, 103, 65, 67, 327, 75, 2135, 7759, 9127, 12289, 28675, 45063, 143371, 241687, 512015,
+          1962087, 274497, 1339459, 13939015 },
+        { 1, 3, 7, 13, 13, 15, 69, 81, 339, 887, 733, 925, 4799, 5557, 1281, 37123, 37639, 14093, 105741, 23823,
+          261957, 128337, 5357651, 5030007 },
+        { 1, 1, 3, 13, 7, 35, 63, 113, 401, 19, 221, 2999, 2387, 12527, 21249, 27905, 122115, 42765, 305415, 273187,
+          1898303, 213873, 2088081, 1117459 },
+        { 1, 3, 5, 9, 1, 25, 53, 137, 331, 813, 193, 2777, 5617, 7357, 4801, 2883, 94277, 63049, 343105, 94041,
+          651381, 2134089, 970763, 16175469 },
+        { 1, 3, 1, 13, 9, 35, 107, 57, 427, 201, 1429, 1825, 2683, 8371, 26049, 18243, 74305, 173389, 255945, 322019,
+          2072363, 2336761, 7240939, 6200457 },
+        { 1, 3, 1, 5, 27, 61, 31, 149, 287, 245, 1945, 751, 5561, 643, 17809, 19187, 55185, 60469, 464139, 92941,
+          339215, 3108805, 1697199, 986149 },
+        { 1, 1, 5, 11, 19, 41, 61, 213, 5, 385, 655, 2183, 4485, 4593, 1521, 44401, 93525, 52763, 376835, 344121,
+          540781, 3162213, 7356725, 1131281 },
+        { 1, 3, 5, 3, 3, 13, 69, 157, 207, 521, 519, 1551, 4649, 2641, 5809, 49075, 11349, 258003, 468563, 794749,
+          262229, 3932269, 6029759, 262681 },
+        { 1, 1, 7, 13, 1, 19, 1, 181, 109, 779, 161, 117, 895, 5133, 9297, 44177, 108215, 193181, 253905, 787267,
+          1315889, 795685, 7122365, 4564347 },
+        { 1, 3, 7, 5, 13, 19, 59, 247, 109, 861, 1087, 3827, 5237, 13649, 4565, 5447, 100179, 70937, 351553, 38007,
+          1815871, 4165931, 7705745, 2689009 },
+        { 1, 1, 3, 9, 25, 29, 41, 3, 471, 445, 803, 3503, 755, 2655, 21197, 64125, 117815, 115965, 50117, 904425,
+          1494077, 2522279, 5114915, 14040609 },
+        { 1, 3, 5, 13, 23, 1, 55, 151, 485, 951, 155, 1481, 7019, 3193, 1261, 52263, 1393, 70353, 32531, 943365,
+          1267515, 1322307, 3993929, 10834683 },
+        { 1, 3, 7, 3, 13, 59, 17, 43, 109, 629, 849, 359, 2493, 3267, 18869, 33359, 30355, 146687, 82177, 841479,
+          1994069, 1872887, 5875193, 5455465 }
+    };
+    uint32_t x = 0;
+    unsigned j;
+    /* A digit 0 or 1 becomes a mask of zeros or ones: a branch would be guessed wrongly half the time. */
+    for (j = 0; index >> j != 0; j++)
+        x ^= (m[dimension][j] << (METROI_SOBOL_DIGITS - 1 - j)) & (0u - (index >> j & 1u)); /* eq 2.2 */
+    return x;
+}
+
+/* Points that are always the same cannot say how far off their mean is, and a function that happens to agree with
+   their pattern is integrated wrongly for ever. Owen (1995) shuffles the digits and keeps the cells: flip the first
+   digit of all points or of none; then, in each half by a coin of its own, the second digit; in each quarter the
+   third, and so on.
+
+       y_j = x_j + c(x_1 x_2 ... x_{j-1})   "modulo 2"                                (2.4)
+
+   Each interval of length $2^{-k}$ is carried onto another as a whole, so the points stay as even as they were, while
+   each one becomes uniform. For every square-integrable function the variance falls faster than 1/N, and it stays
+   within a bounded factor of that of random points (Owen 1997).
+
+   The coins $c$ sit in the nodes of a binary tree: the root decides digit 1, and node $i$ has the children $2i$ and
+   $2i+1$ for the digits 0 and 1. Nobody can store 2^24 of them, so they are hashes. (Laine and Karras 2011 flip all
+   digits with four multiplications of the mirrored number; it is faster, but the flips of the first digits then take
+   only a few of the patterns they should.) One hash of 64 bits has room for the 63 coins of a tree of six levels:
+   four hashes decide 24 digits. Points that differ no sooner than there do not exist among 2^24, so all further
+   digits are plain random bits of the last node. */
+
+static uint64_t metroi_sobol_scramble(uint32_t x, uint64_t key)
+{
+    const uint64_t golden = UINT64_C(0x9e3779b97f4a7c15); /* as in section 2.1 */
+    const unsigned digits = METROI_SOBOL_DIGITS, levels = 6;
+    uint64_t y = 0;
+    unsigned level, below;
+    for (level = 0; level < digits; level += levels) {
+        /* The root of a small tree is a node of the large one, and has a number of its own there. */
+        uint64_t root = (uint64_t)1 << level | x >> (digits - level);
+        uint64_t coins = metroi_mix(key + root * golden);
+        unsigned node = 1;
+        for (below = 0; below < levels; below++) {
+            unsigned digit = x >> (digits - 1 - level - below) & 1;
+            y = y << 1 | (digit ^ (coins >> node & 1)); /* eq 2.4 */
+            node = 2 * node + digit;
+        }
+    }
+    return y << 29 | metroi_mix(key + ((uint64_t)1 << digits | x) * golden) >> 35;
+}
+
+/* The key of a tree mixes the scramble, the coordinate and, beyond 2^24 points, the number of the block. */
+
+METRO_API double metro_sobol(uint64_t index, unsigned dimension, uint64_t scramble)
+{
+    const uint64_t golden = UINT64_C(0x9e3779b97f4a7c15);
+    uint64_t block = index >> METROI_SOBOL_DIGITS;
+    uint32_t within = (uint32_t)(index & ((1u << METROI_SOBOL_DIGITS) - 1u));
+    uint64_t key, point;
+    if (dimension >= 32) return METROI_NAN;
+    key = metroi_mix(metroi_mix(scramble) + (32 * block + dimension + 1) * golden);
+    point = metroi_sobol_scramble(metroi_sobol_digits(within, dimension), key);
+    return (double)point * (1.0 / 9007199254740992.0);
+}
+
+#undef METROI_SOBOL_DIGITS
+
+/* # 3 Perturbations
+
+   The tentative transition of the paper adds a random step to the current point. The law of that step is the kernel
+   P, and three things are wanted of it: a draw, for the chain of chapter 4; its density, for the transition matrices
+   of chapter 6 and for checks; and its spectrum, because the start-up theory of chapter 5 is a sum over nothing else.
+   The tests hold the three against each other: draws against the density, the density's transform against the
+   spectrum.
+
+   The domain is the circle of length 1, the interval [0, 1] with reflecting ends, or the sphere. A kernel on the
+   circle is a kernel of the line with all the points that wrapping identifies added up, so sizes above 1 mean
+   something, and something useful: a uniform kernel of width exactly 1, 2 or 3 is independent sampling.
+
+   | shape | size | density of the step u on the line | P*(k) |
+   | METRO_UNIFORM | Delta, full width | 1/Delta for abs(u) < Delta/2 | sin(pi k Delta)/(pi k Delta) |
+   | METRO_TRIANGLE | Delta, full base | (2/Delta)(1 - 2 abs(u)/Delta) | (sin(pi k Delta/2)/(pi k Delta/2))^2 |
+   | METRO_GAUSSIAN | sigma | exp(-u^2/(2 sigma^2))/(sigma sqrt(2 pi)) | exp(-2 pi^2 sigma^2 k^2) |
+   | METRO_CAUCHY | gamma, scale | gamma/(pi (gamma^2 + u^2)) | exp(-2 pi gamma abs(k)) |
+   | METRO_VON_MISES | kappa | exp(kappa cos(2 pi u))/I_0(kappa), wrapped already | I_k(kappa)/I_0(kappa) |
+   | METRO_KELEMEN | s1, s2 | 1/(2 L abs(u)) for s1 <= abs(u) <= s2 | (Ci(2 pi k s2) - Ci(2 pi k s1))/L |
+
+   There sigma is the standard deviation, kappa the concentration, s1 and s2 are the smallest and the largest step,
+   and L = ln(s2/s1).
+
+   The uniform kernel is that of the paper; its (16) prints abs(x - y) < Delta, which integrates to 2, where Delta/2
+   is meant and where paper (17) agrees with us. Kelemen's kernel (Kelemen et al. 2002) spreads the logarithm of the
+   step evenly, so that fine and coarse moves come equally often.
+
+   A large step replaces the kernel, with probability p, by an independent uniform draw:
+
+       P*(k) = (1 - p) K*(k) for k != 0                                               (3.1)
+
+   # 3.1 Points and turns
+
+   A point of the circle is a number in [0, 1). After a step it comes back there by its floor, with one trap: a
+   negative number close to zero plus 1 rounds to 1, which is no point of the circle; 0 is meant. The usual case, a
+   point that has not left, is answered first. */
+
+static double metroi_wrap(double y)
+{
+    if (y >= 0 && y < 1) return y;
+    y -= floor(y);
+    return y >= 1 ? 0 : y;
+}
+
+/* A reflecting interval is a circle of length 2 seen from the side: y and 2 - y are the same point. The end 1 itself
+   is moved to the number below it, so that no cell index runs over. */
+
+static double metroi_fold(double y)
+{
+    if (!(y >= 0 && y < 1)) {
+        y -= 2 * floor(y / 2);
+        if (y > 1) y = 2 - y;
+        if (y >= 1) y = 1 - 1.1102230246251565e-16; /* 2^-53 */
+    }
+    return y;
+}
+
+/* # 3.2 Arguments without loss
+
+   Every coefficient is a sine or cosine of pi k x, and where it is small it is the difference between k x and a whole
+   number that matters. The product k x rounded to a double has lost it. A fused multiply-add keeps the rest,
+
+       k x = p + e, p = fl(k x), e = fma(k, x, -p)                                    (3.2)
+
+   and both parts lose whole periods without rounding before they are added. So sin(pi k x) is exactly 0 where k x is
+   whole and right to the last digits beside such a point, for k whole or half-whole up to 2^53. A product that
+   overflows is an even number many times over: no turns. */
+
+static double metroi_turns(double k, double x, int *quadrant)
+{
+    double p = k * x, e = fma(k, x, -p); /* eq 3.2 */
+    double q, r;
+    *quadrant = 0;
+    if (isinf(p) && isfinite(k) && isfinite(x)) return 0;
+    p -= 2 * rint(p / 2);
+    e -= 2 * rint(e / 2);
+    /* bring k x to [-1/4, 1/4] around a multiple of 1/2 */
+    q = rint(2 * p);
+    e += p - q / 2;
+    r = rint(2 * e);
+    e -= r / 2;
+    if (fabs(e) <= 1) *quadrant = (int)(q + r) & 3;
+    return e;
+}
+
+/* sin(pi k x) */
+static double metroi_sin_pi(double k, double x)
+{
+    int quadrant;
+    double turns = metroi_turns(k, x, &quadrant);
+    double value = quadrant & 1 ? cos(METROI_PI * turns) : sin(METROI_PI * turns);
+    return quadrant & 2 ? -value : value;
+}
+
+/* cos(pi k x) */
+static double metroi_cos_pi(double k, double x)
+{
+    int quadrant;
+    double turns = metroi_turns(k, x, &quadrant);
+    double value = quadrant & 1 ? sin(METROI_PI * turns) : cos(METROI_PI * turns);
+    return quadrant == 1 || quadrant == 2 ? -value : value;
+}
+
+/* Where a coefficient is near 1, its distance from 1 is what the sums of chapter 5 feed on, and 1 - P would lose it.
+   So the gap 1 - P is computed beside P. For sin(y)/y it is the alternating series, nested; y < 0.7 needs seven
+   terms. */
+
+static double metroi_sinc_gap(double y)
+{
+    double z = y * y, sum = 0, m;
+    if (!(fabs(y) < 0.7)) return 1 - sin(y) / y;
+    for (m = 8; m >= 1; m--) sum = z / (2 * m * (2 * m + 1)) * (1 - sum);
+    return sum;
+}
+
+/* Some integrals of this chapter and the next ones are done by the Gauss-Legendre rule with 24 points, which
+   integrates polynomials to degree 47 exactly. Point i = 0 .. 23 of the rule on [0, 1]: */
+
+static double metroi_gauss24(int i, double *weight)
+{
+    static const double rule[12][2] = {
+        { 0.00240639000148931991, 0.0061706148999935997734 }, { 0.012635722014345250901, 0.014265694314466831591 },
+        { 0.030862723998633620738, 0.022138719408709903084 }, { 0.056792236497799482893, 0.029649292457718390373 },
+        { 0.089999007013048539023, 0.036673240705540152867 }, { 0.12993790421072281788, 0.043095080765976637959 },
+        { 0.17595317403151221537, 0.048809326052056944135 }, { 0.22728926430558023217, 0.053722135057982817391 },
+        { 0.28310324618697743076, 0.057752834026862800677 }, { 0.34247866015191831281, 0.060835236463901695602 },
+        { 0.40444056626319184542, 0.062918728173414148061 }, { 0.46797155356869718696, 0.063969097673376078487 }
+    };
+    *weight = rule[i < 12 ? i : 23 - i][1];
+    return i < 12 ? rule[i][0] : 1 - rule[23 - i][0];
+}
+
+/* # 3.3 What is a kernel
+
+   An invalid kernel gives NaN everywhere, so a mistake shows at once instead of passing for a result. */
+
+static int metroi_kernel_valid(const metro_kernel *k)
+{
+    if (!(k->large >= 0 && k->large <= 1) || !(k->size >= 0 && isfinite(k->size))) return 0;
+    switch (k->shape) {
+    case METRO_VON_MISES: return 1;
+    case METRO_KELEMEN: return k->size_min > 0 && k->size_min <= k->size;
+    case METRO_UNIFORM:
+    case METRO_TRIANGLE:
+    case METRO_GAUSSIAN:
+    case METRO_CAUCHY: return k->size > 0;
+    }
+    return 0;
+}
+
+/* L = ln(s2/s1) of Kelemen's kernel, right for s1 close to s2 and for a ratio that overflows. */
+static double metroi_kelemen_log(double s1, double s2)
+{
+    double excess = (s2 - s1) / s1;
+    return excess < 1e300 ? log1p(excess) : log(s2) - log(s1);
+}
+
+/* # 3.4 Drawing a step
+
+   The von Mises step is drawn by the rejection of Best and Fisher (1979) from a wrapped Cauchy envelope. Their
+   parameter is
+
+       s = frac{1 + rho^2}{2 rho}, rho = frac{t - sqrt{2 t}}{2 kappa}, t = 1 + sqrt{1 + 4 kappa^2}      (3.3)
+
+   and rho is the smaller root of rho^2 - 2 s rho + 1 = 0. So s = t/(2 kappa), and s - 1 follows without the
+   cancellation that eq 3.3 has at large kappa:
+
+       s - 1 = frac{1 + 1/(2 kappa + sqrt{1 + 4 kappa^2})}{2 kappa}                   (3.4)
+
+   We carry v = 1 - cos(angle) instead of the cosine for the same reason: at kappa = 1e8 the angles are about 1e-4,
+   and a cosine keeps half of their digits. The step is +-2 asin(sqrt(v/2)) radians. */
+
+static double metroi_von_mises_step(double kappa, metro_rng *rng)
+{
+    double s1, u, c, v, y, turns;
+    if (kappa < 1e-17) return metro_rng_uniform(rng) - 0.5;
+    s1 = (1 + 1 / (2 * kappa + hypot(1, 2 * kappa))) * (0.5 / kappa); /* eq 3.4 */
+    do {
+        u = 0.5 * METROI_PI * metro_rng_uniform(rng);
+        c = cos(u);
+        u = sin(u);
+        /* a point of the envelope: v = (s - 1)(1 - z)/(s + z) with z = cos(2 u) */
+        v = 2 * s1 * u * u / (s1 + 2 * c * c);
+        y = kappa * s1 + kappa * v;
+        u = metro_rng_uniform(rng);
+    } while (!(y * (2 - y) > u || log(y / u) + 1 - y >= 0));
+    turns = asin(sqrt(v < 2 ? 0.5 * v : 1)) / METROI_PI;
+    return metro_rng_uniform(rng) < 0.5 ? -turns : turns;
+}
+
+/* Kelemen's step is s2 exp(-L v) with v uniform; one random number serves for the sign and for v. */
+
+static double metroi_kelemen_step(double s1, double s2, metro_rng *rng)
+{
+    double u = 2 * metro_rng_uniform(rng);
+    double v = u < 1 ? u : u - 1, step = s2 * exp(-metroi_kelemen_log(s1, s2) * v);
+    return u < 1 ? step : -step;
+}
+
+/* One step of a valid kernel on the line, without its large steps. The triangle is the sum of two uniform steps of
+   half its width, the Cauchy step the tangent of a uniform angle. */
+
+static double metroi_kernel_step(const metro_kernel *k, metro_rng *rng)
+{
+    double u = 0, v;
+    switch (k->shape) {
+    case METRO_UNIFORM: return k->size * (metro_rng_uniform(rng) - 0.5);
+    case METRO_TRIANGLE:
+        u = metro_rng_uniform(rng);
+        v = metro_rng_uniform(rng);
+        return 0.5 * k->size * (u + v - 1);
+    case METRO_GAUSSIAN: return k->size * metro_rng_normal(rng);
+    case METRO_CAUCHY: return k->size * tan(METROI_PI * (metro_rng_uniform(rng) - 0.5));
+    case METRO_VON_MISES: return metroi_von_mises_step(k->size, rng);
+    case METRO_KELEMEN: return metroi_kelemen_step(k->size_min, k->size, rng);
+    }
+    return u;
+}
+
+/* A step of many turns leaves few digits for where it ends: beyond 2^32 turns fewer than 21 bits. What is lost is
+   close to uniform, because no kernel is steep that far out, and a uniform draw stands for it. */
+
+#define METROI_FAR_STEP 4294967296.0
+
+/* The point that `k` draws from `x`, before it is wrapped or folded. */
+static double metroi_kernel_draw(const metro_kernel *k, double x, metro_rng *rng)
+{
+    double step;
+    if (!metroi_kernel_valid(k) || !isfinite(x)) return METROI_NAN;
+    if (k->large > 0 && metro_rng_uniform(rng) < k->large) return metro_rng_uniform(rng);
+    step = metroi_kernel_step(k, rng);
+    return fabs(step) <= METROI_FAR_STEP ? x + step : metro_rng_uniform(rng);
+}
+
+/* The plain uniform kernel is the inner loop of the laboratory and goes first; the one comparison of its size is all
+   the checking it needs, since NaN fails it. */
+
+METRO_API double metro_kernel_perturb(const metro_kernel *k, double x, metro_rng *rng)
+{
+    if (k->shape == METRO_UNIFORM && k->large == 0 && k->size > 0 && k->size <= METROI_FAR_STEP)
+        return metroi_wrap(x + k->size * (metro_rng_uniform(rng) - 0.5));
+    return metroi_wrap(metroi_kernel_draw(k, x, rng));
+}
+
+METRO_API double metro_kernel_reflect_perturb(const metro_kernel *k, double x, metro_rng *rng)
+{
+    if (k->shape == METRO_VON_MISES) return METROI_NAN;
+    return metroi_fold(metroi_kernel_draw(k, x, rng));
+}
+
+/* # 3.5 The spectrum of Kelemen's kernel
+
+   The transform of a density 1/(2 L abs(u)) between s1 and s2 is a difference of cosine integrals,
+
+       P*(k) = frac{Ci(b) - Ci(a)}{L}, a = 2 pi k s1, b = 2 pi k s2                   (3.5)
+
+   and taking that difference as it stands would lose digits twice: for small b, where P* is near 1, and for s1 near
+   s2, where L is small. Both times we go for the gap. For b below 4 it has a series whose terms stay small,
+
+       1 - P*(k) = frac{1}{L} sum_{m=1}^{inf} (-1)^{m+1} frac{b^{2m}}{2m (2m)!} (1 - e^{-2 m L})      (3.6)
+
+   and for s1 near s2 it is the mean of 2 sin^2 over a short range, for which the Gauss rule is exact to rounding:
+
+       1 - P*(k) = int_{0}^{1} 2 sin^2(pi k s2 e^{-L u}) du                           (3.7)
+
+   The series first. */
+
+static double metroi_kelemen_gap(double b, double l)
+{
+    double sum = 0, power = 1, term, m;
+    for (m = 1; m <= 20; m++) {
+        power *= -b * b / ((2 * m - 1) * 2 * m);
+        term = power * -expm1(-2 * m * l) / (2 * m);
+        sum -= term;
+        if (fabs(term) < 1e-18 * fabs(sum)) break;
+    }
+    return sum / l; /* eq 3.6 */
+}
+
+static void metroi_kelemen_narrow(double frequency, double s2, double b, double l, double *value, double *gap)
+{
+    double sine = metroi_sin_pi(frequency, s2), cosine = metroi_cos_pi(frequency, s2);
+    double sine2 = metroi_sin_pi(2 * frequency, s2), cosine2 = metroi_cos_pi(2 * frequency, s2);
+    double weight, node, s, c, x;
+    int i;
+    *value = *gap = 0;
+    for (i = 0; i < 24; i++) {
+        node = metroi_gauss24(i, &weight);
+        /* the whole turns of k s2 are off already; what e^{-L u} changes is a small angle, taken by its half */
+        x = 0.5 * b * expm1(-l * node);
+        s = sin(x);
+        c = cos(x);
+        x = sine * c + cosine * s;
+        *value += weight * (cosine2 * (1 - 2 * s * s) - sine2 * 2 * s * c);
+        *gap += weight * 2 * x * x; /* eq 3.7 */
+    }
+}
+
+/* Ci(2 pi f s) for an argument x above 4. To 50 by the continued fraction of the exponential integral, evaluated
+   forwards (Lentz 1976, in the form of Press et al. 1992, cisi); above by the asymptotic series (Abramowitz and
+   Stegun 1964, 5.2.34 and 5.2.35), whose smallest term at 50 is 1e-22. Sine and cosine come from section 3.2. */
+
+static double metroi_cosine_integral_series(double x, double sine, double cosine)
+{
+    double z = 1 / (x * x), f = 1, g = 1, even = 1, odd = 1, m;
+    for (m = 1; m <= 40 && odd > 1e-18; m++) {
+        even *= (2 * m - 1) * 2 * m * z;
+        odd *= 2 * m * (2 * m + 1) * z;
+        f += fmod(m, 2) > 0 ? -even : even;
+        g += fmod(m, 2) > 0 ? -odd : odd;
+    }
+    return (sine * f - cosine * g / x) / x;
+}
+
+static double metroi_cosine_integral_fraction(double x, double sine, double cosine)
+{
+    double scale = 1 / (1 + x * x), dr = scale, di = -x * scale, hr = dr, hi = di, cr = 1e300, ci = 0, br = 1, t, u;
+    int i;
+    for (i = 1; i < 200; i++) {
+        double a = -(double)i * (double)i;
+        br += 2;
+        /* d = 1/(a d + b) */
+        t = a * dr + br;
+        u = a * di + x;
+        scale = 1 / (t * t + u * u);
+        dr = t * scale;
+        di = -u * scale;
+        /* c = b + a/c: the first c is as good as infinite, and its square would overflow */
+        scale = i == 1 ? 0 : a / (cr * cr + ci * ci);
+        t = br + cr * scale;
+        ci = x - ci * scale;
+        cr = t;
+        /* h = h c d */
+        t = cr * dr - ci * di;
+        u = cr * di + ci * dr;
+        scale = hr * t - hi * u;
+        hi = hr * u + hi * t;
+        hr = scale;
+        if (fabs(t - 1) + fabs(u) < 1e-16) break;
+    }
+    return -(cosine * hr + sine * hi);
+}
+
+/* Ci(2 pi f s). Below 4: gamma + ln x - sum (-1)^{m+1} x^{2m}/(2m (2m)!), Abramowitz and Stegun (1964), 5.2.16. */
+static double metroi_cosine_integral(double frequency, double s)
+{
+    double x = 2 * METROI_PI * frequency * s, power = 1, sum = 0, sine, cosine, m;
+    if (x <= 4) {
+        for (m = 1; m <= 20 && fabs(power) > 1e-18; m++) {
+            power *= -x * x / ((2 * m - 1) * 2 * m);
+            sum += power / (2 * m);
+        }
+        return 0.57721566490153286061 + log(x) + sum;
+    }
+    if (!(x < 1e300)) return 0;
+    sine = metroi_sin_pi(2 * frequency, s);
+    cosine = metroi_cos_pi(2 * frequency, s);
+    if (x <= 50) return metroi_cosine_integral_fraction(x, sine, cosine);
+    return metroi_cosine_integral_series(x, sine, cosine);
+}
+
+/* The transform of Kelemen's kernel at any frequency of at least 0 (whole or half-whole, for exact phases) and its
+   gap; s1 = s2 are two atoms. Worst absolute error 3e-16. The bounds of the three ranges are where their errors
+   cross. */
+
+static void metroi_kelemen_mode(double s1, double s2, double frequency, double *value, double *gap)
+{
+    double l = metroi_kelemen_log(s1, s2), a = 2 * METROI_PI * frequency * s1, b = 2 * METROI_PI * frequency * s2, x;
+    if (!(s1 < s2)) {
+        x = metroi_sin_pi(frequency, s2);
+        *gap = 2 * x * x;
+        *value = metroi_cos_pi(2 * frequency, s2);
+    } else if (l <= 2 && b > 1.5 && b - a <= 8) {
+        metroi_kelemen_narrow(frequency, s2, b, l, value, gap);
+    } else if (b <= 4) {
+        *gap = metroi_kelemen_gap(b, l);
+        *value = 1 - *gap;
+    } else {
+        *value = (metroi_cosine_integral(frequency, s2) - metroi_cosine_integral(frequency, s1)) / l; /* eq 3.5 */
+        *gap = 1 - *value;
+    }
+}
+
+/* # 3.6 Ratios of Bessel functions
+
+   The von Mises coefficients are I_k(kappa)/I_0(kappa), and those of its relative on the sphere are
+   I_{l+1/2}(kappa)/I_{1/2}(kappa). So we want I_{c+k}/I_c for c = 0 and c = 1/2.
+
+   From kappa = 1000 on, Debye's expansion for large order or argument (NIST Handbook 2010, 10.41.3) gives them at
+   once, for whole k or not. With nu the order and S = sqrt(nu^2 + kappa^2) it reads
+
+       ln I_nu(kappa) ~ kappa - frac{ln(2 pi kappa)}{2} + A(nu)
+       A(nu) = frac{nu^2}{S + kappa} - nu asinh(nu/kappa) - frac{1}{4} ln(1 + nu^2/kappa^2)
+               + ln(1 + d(nu))                                                        (3.8)
+
+   where d(nu) is the sum of u_m(nu/S)/nu^m. Each term of A is small where nu is small, so the logarithm of a
+   coefficient near 1 keeps all its digits. Four terms of d leave 2e-16 at S = 1000. */
+
+#define METROI_DEBYE 1000.0
+
+static double metroi_debye(double order, double s)
+{
+    double z = order / s * (order / s);
+    double u1 = (3 - 5 * z) / 24;
+    double u2 = (81 + z * (-462 + 385 * z)) / 1152;
+    double u3 = (30375 + z * (-369603 + z * (765765 - 425425 * z))) / 414720;
+    double u4 = (4465125 + z * (-94121676 + z * (349922430 + z * (-446185740 + 185910725 * z)))) / 39813120;
+    return (u1 + (u2 + (u3 + u4 / s) / s) / s) / s;
+}
+
+/* A(nu) but for its last term, whose d(nu) it leaves in `d`. */
+static double metroi_debye_log(double nu, double kappa, double *d)
+{
+    double s = hypot(nu, kappa), z = nu / kappa;
+    *d = metroi_debye(nu, s);
+    return nu * (nu / (s + kappa) - asinh(z)) - 0.25 * log1p(z * z);
+}
+
+/* ln(I_{c+k}(kappa)/I_c(kappa)) for kappa >= METROI_DEBYE, c = `order`, k >= 0 real: smooth in k, relative error
+   1e-15. */
+static double metroi_bessel_log(double order, double k, double kappa)
+{
+    double d, d0, low = metroi_debye_log(order, kappa, &d0), high = metroi_debye_log(order + k, kappa, &d);
+    return high - low + log1p((d - d0) / (1 + d0)); /* eq 3.8 */
+}
+
+/* Below kappa = 1000 we multiply the ratios of neighbours, r_j = I_{c+j}/I_{c+j-1}, which follow from each other
+   downwards, where the recurrence is stable (Gautschi 1967),
+
+       r_j = frac{1}{2(c + j)/kappa + r_{j+1}}                                        (3.9)
+
+   from far enough out that starting at 0 is forgotten. Where the leading term of eq 3.8 says that the product
+   underflows, it is 0. */
+
+static double metroi_bessel_product(double order, double k, double kappa)
+{
+    double product = 1, r = 0, j;
+    if (!(k * asinh(k / kappa) - k * k / (hypot(k, kappa) + kappa) <= 760)) return 0;
+    for (j = ceil(k + 60 + 1.5 * sqrt(40 * kappa)); j >= 1; j--) {
+        r = 1 / (2 * (order + j) / kappa + r); /* eq 3.9 */
+        if (j <= k) product *= r;
+    }
+    return product;
+}
+
+/* Products of numbers near 1 lose their distance from 1. For one von Mises coefficient that distance is an integral
+   of positive terms,
+
+       1 - P*(k) = frac{sum_{j} w_j 2 sin^2(pi k j/N)}{sum_{j} w_j}, w_j = e^{-2 kappa sin^2(pi j/N)}      (3.10)
+
+   over the N points of the trapezoidal rule, which converges faster than any power of 1/N for a periodic function
+   (Trefethen and Weideman 2014); N = 12 sqrt(kappa) + 48 + k leaves nothing that a double can see. Terms stop at w_j
+   < 1e-19, so some 20 count, whatever kappa is. Returns the mean of w, which is e^{-kappa} I_0(kappa). */
+
+static double metroi_von_mises_mean(double kappa, double k, double *gap)
+{
+    double nodes = 2 * ceil(6 * sqrt(kappa) + 24 + k / 2), sum = 1, moment = 0, w, s, j;
+    for (j = 1; 2 * j <= nodes; j++) {
+        s = sqrt(kappa) * sin(METROI_PI * (j / nodes));
+        w = exp(-2 * s * s);
+        if (w < 1e-19) break;
+        if (2 * j < nodes) w *= 2;
+        s = sin(METROI_PI * (fmod(k * j, nodes) / nodes));
+        sum += w;
+        moment += w * 2 * s * s;
+    }
+    *gap = moment / sum; /* eq 3.10 */
+    return sum / nodes;
+}
+
+/* Chapter 5 wants all coefficients up to some k, as logarithms that are right both where P* is near 1 and where it
+   has all but vanished. Upwards, the gaps follow from each other,
+
+       delta_{k+1} = delta_{k-1} + frac{2(c + k)}{kappa} (1 - delta_k), delta_0 = 0   (3.11)
+
+   stably while P* is not small; beyond delta = 3/4 the ratios of eq 3.9 take over. */
+
+static void metroi_bessel_logs(double order, double first_gap, double kappa, size_t count, double *log_value)
+{
+    double r = 0, before = 0, gap = first_gap, next;
+    size_t j;
+    if (kappa >= METROI_DEBYE) {
+        for (j = 1; j <= count; j++) log_value[j - 1] = metroi_bessel_log(order, (double)j, kappa);
+        return;
+    }
+    /* ratios, downwards */
+    for (j = count + 60 + (size_t)(1.5 * sqrt(40 * kappa)); j >= 1; j--) {
+        r = 1 / (2 * (order + (double)j) / kappa + r); /* eq 3.9 */
+        if (j <= count) log_value[j - 1] = r;
+    }
+    /* gaps, upwards */
+    for (j = 1; j <= count && kappa >= 1 && gap < 0.75; j++) {
+        log_value[j - 1] = log1p(-gap);
+        next = before + 2 * (order + (double)j) / kappa * (1 - gap); /* eq 3.11 */
+        before = gap;
+        gap = next;
+    }
+    /* and on by the ratios */
+    for (; j <= count; j++) log_value[j - 1] = log(log_value[j - 1]) + (j > 1 ? log_value[j - 2] : 0);
+}
+
+/* ln P*(j) for j = 1 .. count: von Mises, and von Mises-Fisher on the sphere (there delta_1 = 1/kappa - 2/(e^{2
+   kappa} - 1)). -inf where kappa is 0. Cost: some 20 ns a value. */
+
+static void metroi_von_mises_logs(double kappa, size_t count, double *log_value)
+{
+    double gap = 1;
+    if (kappa >= 1 && kappa < METROI_DEBYE) metroi_von_mises_mean(kappa, 1, &gap);
+    metroi_bessel_logs(0, gap, kappa, count, log_value);
+}
+
+static void metroi_vmf_logs(double kappa, size_t count, double *log_value)
+{
+    double gap = kappa >= 1 ? 1 / kappa - 2 / expm1(2 * kappa) : 1;
+    metroi_bessel_logs(0.5, gap, kappa, count, log_value);
+}
+
+/* # 3.7 One mode at a time
+
+   The coefficient of a valid kernel at a frequency (k on the circle, k/2 on the interval) and its gap, both accurate
+   where they are small. */
+
+static void metroi_von_mises_mode(double kappa, double k, double *value, double *gap)
+{
+    if (kappa >= METROI_DEBYE) {
+        double l = metroi_bessel_log(0, k, kappa);
+        *value = exp(l);
+        *gap = -expm1(l);
+    } else if (k * k < 2 * kappa) {
+        metroi_von_mises_mean(kappa, k, gap);
+        *value = 1 - *gap;
+    } else {
+        *value = metroi_bessel_product(0, k, kappa);
+        *gap = 1 - *value;
+    }
+}
+
+/* sin(pi f h)/(pi f h), paper (17), and its gap. */
+static void metroi_sinc_mode(double frequency, double h, double *value, double *gap)
+{
+    double y = METROI_PI * (frequency * h);
+    if (y < 0.7) {
+        *gap = metroi_sinc_gap(y);
+        *value = 1 - *gap;
+    } else {
+        *value = y < 1e300 ? metroi_sin_pi(frequency, h) / y : 0;
+        *gap = 1 - *value;
+    }
+}
+
+static void metroi_kernel_mode(const metro_kernel *k, double frequency, double *value, double *gap)
+{
+    double s = k->size, f = fabs(frequency), v = 1, g = 0, e = 0;
+    switch (k->shape) {
+    case METRO_UNIFORM: metroi_sinc_mode(f, s, &v, &g); break;
+    case METRO_TRIANGLE:
+        metroi_sinc_mode(f, s / 2, &v, &g);
+        g *= 1 + v;
+        v *= v;
+        break;
+    case METRO_GAUSSIAN: e = 2 * (METROI_PI * s * f) * (METROI_PI * s * f); break;
+    case METRO_CAUCHY: e = 2 * METROI_PI * s * f; break;
+    case METRO_VON_MISES: metroi_von_mises_mode(s, f, &v, &g); break;
+    case METRO_KELEMEN: metroi_kelemen_mode(k->size_min, s, f, &v, &g); break;
+    }
+    if (k->shape == METRO_GAUSSIAN || k->shape == METRO_CAUCHY) {
+        v = exp(-e);
+        g = -expm1(-e);
+    }
+    *value = (1 - k->large) * v; /* eq 3.1 */
+    *gap = (1 - k->large) * g + k->large;
+}
+
+static double metroi_kernel_value(const metro_kernel *k, double frequency)
+{
+    double value, gap;
+    if (!metroi_kernel_valid(k)) return METROI_NAN;
+    if (frequency == 0) return 1;
+    metroi_kernel_mode(k, frequency, &value, &gap);
+    return value;
+}
+
+METRO_API double metro_kernel_coefficient(const metro_kernel *k, long harmonic)
+{
+    return metroi_kernel_value(k, (double)harmonic);
+}
+
+METRO_API double metro_kernel_reflect_coefficient(const metro_kernel *k, long harmonic)
+{
+    return k->shape == METRO_VON_MISES ? METROI_NAN : metroi_kernel_value(k, 0.5 * (double)harmonic);
+}
+
+/* # 3.8 Densities on the circle
+
+   Wrapping adds up what the density of the line has at u, u + 1, u - 1, and so on. For steps of many turns those sums
+   have closed forms; d is the distance of the two points on the circle, between 0 and 1/2.
+
+   The uniform kernel counts the whole numbers within Delta/2 of d, and one that is exactly at the end counts half:
+   with F(t) the mean of floor and ceiling, the count is F(Delta/2 - d) + F(Delta/2 + d). */
+
+static double metroi_uniform_density(double size, double d)
+{
+    double a = 0.5 * size - d, b = 0.5 * size + d;
+    return (0.5 * (floor(a) + ceil(a)) + 0.5 * (floor(b) + ceil(b))) / size;
+}
+
+/* The triangle whose half base h exceeds 1/2: what differs from the uniform density is itself a small triangle, whose
+   half base g is the distance of h from the nearest whole number,
+
+       P(d) = 1 + frac{max(0, g - d) - g^2}{h^2}                                      (3.12)
+
+   as its coefficients sinc(k h)^2 = (g/h)^2 sinc(k g)^2 say. */
+
+static double metroi_triangle_density(double size, double d)
+{
+    double h = 0.5 * size, g = fabs(h - rint(h));
+    if (h <= 0.5) return d < h ? (1 - d / h) / h : 0;
+    return 1 + ((d < g ? g - d : 0) / h - g * (g / h)) / h; /* eq 3.12 */
+}
+
+/* The Gaussian as a sum of its images or, where it is wide, as its Fourier series: at sigma = 1/4 both need six
+   terms. The two agree by Poisson's summation formula. */
+
+static double metroi_gaussian_density(double sigma, double d)
+{
+    double sum = 0, m;
+    if (sigma > 0.25) {
+        for (m = 6; m >= 1; m--) {
+            double y = METROI_PI * sigma * m;
+            sum += exp(-2 * y * y) * metroi_cos_pi(2 * m, d);
+        }
+        return 1 + 2 * sum;
+    }
+    for (m = -3; m <= 3; m++) sum += exp(-0.5 * ((d + m) / sigma) * ((d + m) / sigma));
+    return sum / (sqrt(2 * METROI_PI) * sigma);
+}
+
+/* The Cauchy images add up to a Poisson kernel, with q = exp(-2 pi gamma):
+
+       P(d) = frac{(1 - q)(1 + q)}{(1 - q)^2 + 4 q sin^2(pi d)}                       (3.13)
+
+   which we divide through by 1 - q, so that nothing underflows for a tiny gamma. */
+
+static double metroi_cauchy_density(double gamma, double d)
+{
+    double q = exp(-2 * METROI_PI * gamma), gap = -expm1(-2 * METROI_PI * gamma), s = sin(METROI_PI * d);
+    return (1 + q) / (gap + 4 * q * (s * s / gap)); /* eq 3.13 */
+}
+
+static double metroi_von_mises_density(double kappa, double d)
+{
+    double gap, s = sqrt(kappa) * sin(METROI_PI * d);
+    return exp(-2 * s * s) / metroi_von_mises_mean(kappa, 0, &gap);
+}
+
+/* Kelemen's kernel needs the sum of 1/y over y, y + 1, ... inside [s1, s2]. Thirty-two terms are added as they are; a
+   longer sum is added up to 16 and finished by the asymptotic series of the digamma function (Abramowitz and Stegun
+   1964, 6.3.18), which leaves 1e-16 there. */
+
+static double metroi_digamma_rest(double y)
+{
+    double z = 1 / (y * y);
+    return -0.5 / y - z * (1 / 12.0 - z * (1 / 120.0 - z * (1 / 252.0 - z * (1 / 240.0 - z / 132.0))));
+}
+
+static double metroi_reciprocal_sum(double y, double s1, double s2)
+{
+    double first = s1 > y ? ceil(s1 - y) : 0, last = floor(s2 - y), sum = 0, j;
+    if (last < first) return 0;
+    /* an end that falls on s1 or s2 counts half */
+    if (y + first == s1) sum -= 0.5 / (y + first);
+    if (y + last == s2) sum -= 0.5 / (y + last);
+    for (j = first; j <= last && (last - first <= 32 || y + j < 16); j++) sum += 1 / (y + j);
+    if (j > last) return sum;
+    return sum + log1p((last + 1 - j) / (y + j)) + metroi_digamma_rest(y + last + 1) - metroi_digamma_rest(y + j);
+}
+
+static double metroi_kelemen_density(double s1, double s2, double d)
+{
+    double sum;
+    if (!(s1 < s2)) return d == fabs(s1 - rint(s1)) ? METROI_INFINITY : 0;
+    sum = metroi_reciprocal_sum(d, s1, s2) + metroi_reciprocal_sum(1 - d, s1, s2);
+    return sum / (2 * metroi_kelemen_log(s1, s2));
+}
+
+/* The density of a valid kernel at signed distance `step`, on a circle of length `length` (1, or 2 for the
+   interval). */
+
+static double metroi_circle_density(const metro_kernel *k, double step, double length)
+{
+    double size = k->size / length, d = fabs(step / length - rint(step / length)), density = 0;
+    if (k->large == 1) return 1 / length;
+    switch (k->shape) {
+    case METRO_UNIFORM: density = metroi_uniform_density(size, d); break;
+    case METRO_TRIANGLE: density = metroi_triangle_density(size, d); break;
+    case METRO_GAUSSIAN: density = metroi_gaussian_density(size, d); break;
+    case METRO_CAUCHY: density = metroi_cauchy_density(size, d); break;
+    case METRO_VON_MISES: density = metroi_von_mises_density(size, d); break;
+    case METRO_KELEMEN: density = metroi_kelemen_density(k->size_min / length, size, d); break;
+    }
+    return ((1 - k->large) * density + k->large) / length;
+}
+
+METRO_API double metro_kernel_density(const metro_kernel *k, double from, double to)
+{
+    if (!metroi_kernel_valid(k) || !isfinite(from) || !isfinite(to)) return METROI_NAN;
+    return metroi_circle_density(k, to - from, 1);
+}
+
+/* On the interval a step from x to y goes straight or by way of the mirror image -y; on the circle of length 2 those
+   are two points, and their densities add up:
+
+       P(x -> y) = C(y - x) + C(y + x), C the kernel on the circle of length 2        (3.14)
+
+   Both distances are the same, to the last bit, when x and y change places. */
+
+METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from, double to)
+{
+    if (!metroi_kernel_valid(k) || k->shape == METRO_VON_MISES || !isfinite(from) || !isfinite(to)) return METROI_NAN;
+    from = fabs(from - 2 * rint(from / 2));
+    to = fabs(to - 2 * rint(to / 2));
+    return metroi_circle_density(k, to - from, 2) + metroi_circle_density(k, to + from, 2); /* eq 3.14 */
+}
+
+/* # 3.9 Directions
+
+   A direction is turned by an angle theta from the old one, in a plane at a uniform azimuth. Near the axis 1 -
+   cos(theta) is what is known well, t, and sin(theta) is sqrt(t (2 - t)). The frame around the old direction is that
+   of Duff et al. (2017): it has no branch and no direction where it fails, unlike a cross product with a fixed axis.
+   The result is normalised, so that rounding does not add up over a long chain; an old direction whose squared length
+   is off 1 by a per cent is a mistake of the caller and gives NaN. */
+
+static metro_vec3 metroi_direction_turn(metro_vec3 n, double t, metro_rng *rng)
+{
+    double sign = n.z < 0 ? -1 : 1, a = -1 / (sign + n.z), b = n.x * n.y * a;
+    double azimuth = 2 * METROI_PI * metro_rng_uniform(rng), radius = sqrt(t < 2 ? t * (2 - t) : 0);
+    double u = radius * cos(azimuth), v = radius * sin(azimuth), w = 1 - t;
+    if (!(fabs(metro_dot(n, n) - 1) < 0.01)) w = METROI_NAN;
+    return metro_normalize(metro_vec3_make(u * (1 + sign * n.x * n.x * a) + v * b + w * n.x,
+                                           u * sign * b + v * (sign + n.y * n.y * a) + w * n.y,
+                                           -u * sign * n.x - v * n.y + w * n.z));
+}
+
+/* t = 1 - cos(theta) between unit vectors: half the squared distance of their tips, which keeps its digits where the
+   cosine is near 1. */
+
+static double metroi_direction_gap(metro_vec3 from, metro_vec3 to)
+{
+    metro_vec3 d = metro_subtract(to, from);
+    return 0.5 * metro_dot(d, d);
+}
+
+/* The greatest t of a cone, 1 - cos(half angle) = 2 sin^2(half angle/2); NaN for what is no cone. */
+static double metroi_cone_height(double half_angle)
+{
+    double s = sin(0.5 * half_angle);
+    if (!(half_angle > 0 && isfinite(half_angle))) return METROI_NAN;
+    return half_angle < METROI_PI ? 2 * s * s : 2;
+}
+
+/* The height of a uniform point of a spherical cap is uniform (Archimedes). */
+
+METRO_API metro_vec3 metro_cone_perturb(double half_angle, metro_vec3 from, metro_rng *rng)
+{
+    double height = metroi_cone_height(half_angle);
+    return metroi_direction_turn(from, height * metro_rng_uniform(rng), rng);
+}
+
+METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_vec3 to)
+{
+    double height = metroi_cone_height(half_angle), t = metroi_direction_gap(from, to);
+    if (isnan(height) || isnan(t)) return METROI_NAN;
+    return t <= height || height == 2 ? 1 / (2 * METROI_PI * height) : 0;
+}
+
+/* The von Mises-Fisher density e^{kappa cos theta} is an exponential in t = 1 - cos(theta), cut off at 2. Its
+   distribution function has an inverse (Ulrich 1984; Jakob 2012 for the form that does not overflow):
+
+       t = -frac{1}{kappa} ln(1 - u (1 - e^{-2 kappa})), u uniform                    (3.15)
+
+   and per steradian it is frac{kappa}{2 pi (1 - e^{-2 kappa})} e^{-kappa t}. Below kappa = 1e-17 it is uniform to the
+   last bit. */
+
+METRO_API metro_vec3 metro_vmf_perturb(double kappa, metro_vec3 from, metro_rng *rng)
+{
+    double u = metro_rng_uniform(rng);
+    double t = kappa < 1e-17 ? 2 * u : -log1p(u * expm1(-2 * kappa)) / kappa; /* eq 3.15 */
+    if (!(kappa >= 0 && isfinite(kappa))) t = METROI_NAN;
+    return metroi_direction_turn(from, t, rng);
+}
+
+METRO_API double metro_vmf_density(double kappa, metro_vec3 from, metro_vec3 to)
+{
+    double t = metroi_direction_gap(from, to);
+    if (!(kappa >= 0 && isfinite(kappa)) || isnan(t)) return METROI_NAN;
+    return kappa < 1e-17 ? 1 / (4 * METROI_PI) : kappa / (-2 * METROI_PI * expm1(-2 * kappa)) * exp(-kappa * t);
+}
+
+/* # 3.10 Spectra on the sphere
+
+   A kernel that depends on the angle alone multiplies every spherical harmonic of degree l by the same number
+   lambda_l, its Legendre coefficient (Funk 1915, Hecke 1918). For the cone,
+
+       lambda_l = frac{P_{l-1}(c) - P_{l+1}(c)}{(2l+1)(1 - c)}, c = cos(alpha)        (3.16)
+
+   and for a narrow cone eq 3.16 is 0/0. With w = 1 - c = 2 sin^2(alpha/2), h = cos^2(alpha/2) and lambda_{i+1} = h
+   C_i, the recurrence of the Legendre polynomials becomes one for the differences D_i = C_i - C_{i-1}, where nothing
+   cancels:
+
+       D_{i+1} = frac{i D_i - (2i+3) w C_i}{i + 3}, C_{i+1} = C_i + D_{i+1}, C_0 = 1, D_0 = 0       (3.17)
+
+   We carry 1 - C, so that chapter 5 has the logarithm of C as well. A cone wider than pi/2 is the whole sphere less a
+   narrow cone around the other pole, so
+
+       lambda_l(alpha) = (-1)^{l+1} cot^2(alpha/2) lambda_l(pi - alpha)               (3.18)
+
+   which also keeps the digits of a cone close to the whole sphere. */
+
+typedef struct {
+    double w, gap; /* w = 1 - cos(alpha); gap = 1 - C_i: lambda_{i+1} = cos^2(alpha/2) (1 - gap) */
+    double d, i;
+} metroi_cone;
+
+static metroi_cone metroi_cone_start(double height)
+{
+    metroi_cone cone;
+    cone.w = height;
+    cone.gap = cone.d = cone.i = 0;
+    return cone;
+}
+
+static void metroi_cone_next(metroi_cone *cone)
+{
+    cone->d = (cone->i * cone->d - (2 * cone->i + 3) * cone->w * (1 - cone->gap)) / (cone->i + 3); /* eq 3.17 */
+    cone->gap -= cone->d;
+    cone->i++;
+}
+
+METRO_API double metro_cone_coefficient(double half_angle, int degree)
+{
+    double angle = half_angle <= 0.5 * METROI_PI ? half_angle : METROI_PI - half_angle + 1.2246467991473532e-16, h, t;
+    metroi_cone cone = metroi_cone_start(metroi_cone_height(angle));
+    if (!(half_angle > 0 && isfinite(half_angle)) || degree < 0) return METROI_NAN;
+    if (degree == 0) return 1;
+    if (half_angle >= METROI_PI) return 0;
+    while (cone.i + 1 < degree) metroi_cone_next(&cone);
+    h = cos(0.5 * angle);
+    if (half_angle <= 0.5 * METROI_PI) return h * h * (1 - cone.gap);
+    t = sin(0.5 * angle); /* eq 3.18: cot(alpha/2) = tan((pi - alpha)/2), and cos^2 cancels */
+    return (degree % 2 ? t * t : -t * t) * (1 - cone.gap);
+}
+
+METRO_API double metro_vmf_coefficient(double kappa, int degree)
+{
+    double logarithm;
+    if (!(kappa >= 0 && isfinite(kappa)) || degree < 0) return METROI_NAN;
+    if (degree == 0) return 1;
+    if (kappa >= METROI_DEBYE) return exp(metroi_bessel_log(0.5, degree, kappa));
+    if (degree > 1) return metroi_bessel_product(0.5, degree, kappa);
+    metroi_vmf_logs(kappa, 1, &logarithm);
+    return exp(logarithm);
+}
+
+#undef METROI_FAR_STEP
+#undef METROI_DEBYE
+
+/* # 4 The chain
+
+   This chapter is the sampler, and there is no other: the one-dimensional laboratory, the light paths and the ray
+   bundles are targets of the same chain.
+
+   We want the integral of a vector-valued f, and have an importance I, a number that is large where f is. If
+   states $z_i$ come with density I(z)/b, where b is the integral of I, then (paper (2))
+
+       int f(z) dz = b E[frac{f(z)}{I(z)}] ~ frac{b}{M} sum_{i=1}^{M} frac{f(z_i)}{I(z_i)}                   (4.1)
+
+   Three things hide in this line. It needs I > 0 wherever f is not 0, or part of the integral is never visited. b is
+   a second unknown, to be estimated with an error of its own. And the states have that density only in the limit: how
+   far from it they are after n steps is the subject of this book. */
+
+/* # 4.1 Acceptance
+
+   The chain at state i draws a tentative state t with density T(i -> t) and accepts it with probability
+
+       a(i -> t) = min(1, frac{I(t) T(t -> i)}{I(i) T(i -> t)})                                              (4.2)
+
+   The printed algorithm of the paper has T the other way round, $I(t) T(i -> t)$ over $I(i) T(t -> i)$ in effect,
+   since its own T cancels. On a ring of five states with T = .7 to the right and .3 to the left and target (.05, .1,
+   .15, .2, .5) that form converges to (.055, .066, .089, .150, .640); eq 4.2 gives the target. With it, the flow from
+   i to t and the flow back are equal when the density is I/b,
+
+       I(i) T(i -> t) a(i -> t) = min(I(i) T(i -> t), I(t) T(t -> i)) = I(t) T(t -> i) a(t -> i)             (4.3)
+
+   which is called detailed balance and makes I/b stationary (Metropolis et al. 1953; Hastings 1970).
+
+   The quotient of two importances can leave the range of doubles, 1e300 over 1e-300, where a ratio of transitions
+   brings it back. Only then do we take logarithms. */
+
+static double metroi_acceptance(double current, double tentative, double ratio)
+{
+    double quotient = tentative / current, a = quotient * ratio;
+    if (!(tentative > 0) || !(ratio > 0)) return 0;
+    if (!(quotient > 1e-290 && quotient < 1e290 && a > 1e-290 && a < 1e290))
+        a = exp(log(tentative) - log(current) + log(ratio));
+    return a < 1 ? a : 1; /* eq 4.2 */
+}
+
+/* A number that is not a proper importance or ratio counts as zero, so the tentative state is rejected; it is
+   counted, and never repaired. */
+
+static double metroi_count_value(metro_chain_counts *counts, double value)
+{
+    if (isnan(value)) counts->nan++;
+    else if (value < 0) counts->negative++;
+    else if (isinf(value)) counts->infinite++;
+    else return value;
+    return 0;
+}
+
+/* # 4.2 The space
+
+   A state is an array of doubles, one for a circle or an interval and three for a direction. Each kind of axis knows
+   how to draw uniformly, how to perturb by its kernel (chapter 3), and how far apart two points are. */
+
+static size_t metroi_axis_doubles(metro_axis_kind kind)
+{
+    return kind == METRO_DIRECTION ? 3 : 1;
+}
+
+static size_t metroi_state_doubles(const metro_target *target)
+{
+    size_t doubles = 0, i;
+    for (i = 0; i < target->axis_count; i++) doubles += metroi_axis_doubles(target->axes[i].kind);
+    return doubles;
+}
+
+static int metroi_axis_valid(const metro_axis *axis)
+{
+    metro_shape shape = axis->kernel.shape;
+    if (axis->kernel.large != 0 || !metroi_kernel_valid(&axis->kernel)) return 0;
+    if (axis->kind == METRO_DIRECTION) return shape == METRO_UNIFORM || shape == METRO_VON_MISES;
+    return axis->kind == METRO_CIRCLE || (axis->kind == METRO_INTERVAL && shape != METRO_VON_MISES);
+}
+
+static void metroi_direction_put(metro_vec3 direction, double *z)
+{
+    z[0] = direction.x;
+    z[1] = direction.y;
+    z[2] = direction.z;
+}
+
+static void metroi_state_draw(const metro_target *target, double *z, metro_rng *rng)
+{
+    size_t i;
+    for (i = 0; i < target->axis_count; i++) {
+        metro_axis_kind kind = target->axes[i].kind;
+        if (kind == METRO_DIRECTION) metroi_direction_put(metro_rng_direction(rng), z);
+        else *z = metro_rng_uniform(rng);
+        z += metroi_axis_doubles(kind);
+    }
+}
+
+static void metroi_direction_perturb(const metro_kernel *kernel, const double *from, double *to, metro_rng *rng)
+{
+    metro_vec3 direction = metro_vec3_make(from[0], from[1], from[2]);
+    if (kernel->shape == METRO_UNIFORM) direction = metro_cone_perturb(kernel->size, direction, rng);
+    else direction = metro_vmf_perturb(kernel->size, direction, rng);
+    metroi_direction_put(direction, to);
+}
+
+static void metroi_state_perturb(const metro_target *target, const double *from, double *to, metro_rng *rng)
+{
+    const metro_axis *axis = target->axes, *end = axis + target->axis_count;
+    for (; axis < end; axis++) {
+        if (axis->kind == METRO_CIRCLE) *to++ = metro_kernel_perturb(&axis->kernel, *from++, rng);
+        else if (axis->kind == METRO_INTERVAL) *to++ = metro_kernel_reflect_perturb(&axis->kernel, *from++, rng);
+        else {
+            metroi_direction_perturb(&axis->kernel, from, to, rng);
+            from += 3;
+            to += 3;
+        }
+    }
+}
+
+/* The squared distance is the sum over the axes: the shorter way round a circle, the length of an interval, the angle
+   between directions, whose sine and cosine are the lengths of cross and dot product. */
+
+static double metroi_direction_angle(const double *a, const double *b)
+{
+    metro_vec3 u = metro_vec3_make(a[0], a[1], a[2]), v = metro_vec3_make(b[0], b[1], b[2]);
+    return atan2(metro_length(metro_cross(u, v)), metro_dot(u, v));
+}
+
+static double metroi_state_distance2(const metro_target *target, const double *a, const double *b)
+{
+    const metro_axis *axis = target->axes, *end = axis + target->axis_count;
+    double sum = 0;
+    for (; axis < end; axis++) {
+        size_t doubles = metroi_axis_doubles(axis->kind);
+        double d = doubles == 3 ? metroi_direction_angle(a, b) : fabs(*a - *b);
+        if (axis->kind == METRO_CIRCLE && d > 0.5) d = 1 - d;
+        sum += d * d;
+        a += doubles;
+        b += doubles;
+    }
+    return sum;
+}
+
+/* # 4.3 Making a chain
+
+   Current and tentative state, and the samples that belong to them, live in one allocation. Accepting swaps two pairs
+   of pointers, so a step copies nothing, whatever the size of a sample. Sizes are rounded up to 16 bytes, so that a
+   sample of any type is aligned. */
+
+static metro_result metroi_chain_check(const metro_target *target, const metro_chain_options *options)
+{
+    size_t i;
+    if (target->axis_count == 0 || target->axes == NULL || target->importance == NULL) return METRO_ERROR_ARGUMENT;
+    if (target->axis_count > SIZE_MAX / 256 || target->sample_size > SIZE_MAX / 8) return METRO_ERROR_ARGUMENT;
+    if (!(options->large_step >= 0 && options->large_step <= 1)) return METRO_ERROR_ARGUMENT;
+    for (i = 0; target->propose == NULL && i < target->axis_count; i++)
+        if (!metroi_axis_valid(&target->axes[i])) return METRO_ERROR_ARGUMENT;
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_chain_make(const metro_target *target, const metro_chain_options *options, metro_rng rng,
+                                        metro_chain *chain)
+{
+    metro_chain made;
+    metro_result result;
+    size_t state_size, sample_size;
+    unsigned char *memory;
+    memset(&made, 0, sizeof made);
+    if (options != NULL) made.options = *options;
+    result = metroi_chain_check(target, &made.options);
+    if (result != METRO_OK) return result;
+    state_size = (metroi_state_doubles(target) * sizeof(double) + 15) / 16 * 16;
+    sample_size = (target->sample_size + 15) / 16 * 16;
+    memory = (unsigned char *)METRO_MALLOC(2 * (state_size + sample_size));
+    if (memory == NULL) return METRO_ERROR_MEMORY;
+    memset(memory, 0, 2 * (state_size + sample_size));
+    made.target = *target;
+    made.rng = rng;
+    made.start_weight = 1;
+    made.memory = memory;
+    made.state = (double *)(void *)memory;
+    made.tentative = (double *)(void *)(memory + state_size);
+    made.sample = memory + 2 * state_size;
+    made.tentative_sample = memory + 2 * state_size + sample_size;
+    *chain = made;
+    return METRO_OK;
+}
+
+METRO_API void metro_chain_free(metro_chain *chain)
+{
+    METRO_FREE(chain->memory);
+    memset(chain, 0, sizeof *chain);
+}
+
+/* # 4.4 A step
+
+   A tentative state is a perturbation, the target's own proposal, or, with the probability of a large step, a uniform
+   draw of all axes. A large step goes from anywhere to anywhere with density 1, so its ratio is 1; and it is an
+   independent uniform draw, so its importance is one more sample of b, free of charge. */
+
+static double metroi_chain_propose(metro_chain *chain, int *large)
+{
+    const metro_target *target = &chain->target;
+    *large = chain->options.large_step > 0 && metro_rng_uniform(&chain->rng) < chain->options.large_step;
+    if (*large) metroi_state_draw(target, chain->tentative, &chain->rng);
+    else if (target->propose != NULL)
+        return target->propose(chain->state, chain->tentative, &chain->rng, target->user);
+    else metroi_state_perturb(target, chain->state, chain->tentative, &chain->rng);
+    return 1;
+}
+
+static void metroi_chain_swap(metro_chain *chain, double importance)
+{
+    double *state = chain->state;
+    void *sample = chain->sample;
+    chain->state = chain->tentative;
+    chain->sample = chain->tentative_sample;
+    chain->tentative = state;
+    chain->tentative_sample = sample;
+    chain->importance = importance;
+}
+
+static void metroi_chain_record(const metro_chain *chain, const void *sample, double weight)
+{
+    if (weight > 0 && chain->target.record != NULL) chain->target.record(sample, weight, chain->target.user);
+}
+
+METRO_API void metro_chain_flush(metro_chain *chain)
+{
+    metroi_chain_record(chain, chain->sample, chain->weight);
+    chain->weight = 0;
+}
+
+/* A step ends in the tentative state with probability a and in the current one otherwise. Instead of recording the
+   one that chance picks we may record both, each with its probability, which has the same mean and a smaller variance
+   (Veach and Guibas 1997 call it expected values): for any h, given the states i and t,
+
+       E[h(z_next)] = a(i -> t) h(t) + (1 - a(i -> t)) h(i)                                                  (4.4)
+
+   A state that is rejected often would be recorded often. We let the current sample collect its weights and record
+   it once, when it is left. */
+
+METRO_API int metro_chain_step(metro_chain *chain)
+{
+    metro_chain_counts *counts = &chain->counts;
+    double ratio, importance, a, moved, stayed;
+    int large, accepted;
+    counts->steps++;
+    if (!(chain->importance > 0)) return 0; /* not started, or no candidate had importance */
+
+    /* Draw a tentative state and weigh it */
+    ratio = metroi_chain_propose(chain, &large);
+    importance = chain->target.importance(chain->tentative, chain->tentative_sample, chain->target.user);
+    if (importance == 0) counts->dark++;
+    importance = metroi_count_value(counts, importance);
+    ratio = metroi_count_value(counts, ratio);
+    if (large) {
+        counts->large_steps++;
+        metro_moments_add(&chain->normalisation, importance);
+    }
+    a = metroi_acceptance(chain->importance, importance, ratio);
+    if (a > 0)
+        metro_sum_add(&counts->squared_jump,
+                      a * metroi_state_distance2(&chain->target, chain->state, chain->tentative));
+
+    /* Decide, and share the weight of this step among the two states: eq 4.4, or all to the one it ends in */
+    accepted = a >= 1 || (a > 0 && metro_rng_uniform(&chain->rng) < a);
+    moved = chain->options.expected_values ? a : (double)accepted;
+    stayed = 1 - moved;
+    chain->weight += stayed;
+    if (accepted) {
+        metroi_chain_record(chain, chain->sample, chain->weight);
+        metroi_chain_swap(chain, importance);
+        chain->weight = moved;
+        counts->accepted++;
+        counts->stay = 0;
+    } else {
+        metroi_chain_record(chain, chain->tentative_sample, moved);
+        if (++counts->stay > counts->longest_stay) counts->longest_stay = counts->stay;
+    }
+    return accepted;
+}
+
+METRO_API void metro_chain_run(metro_chain *chain, uint64_t steps)
+{
+    uint64_t i;
+    for (i = 0; i < steps; i++) metro_chain_step(chain);
+    metro_chain_flush(chain);
+}
+
+/* # 4.5 Starting
+
+   The seed decides what the first samples are, and the policies below are the ways to live with that. All of them end
+   here: a state whose importance is positive becomes the current one. */
+
+static metro_result metroi_seed_check(double importance)
+{
+    if (importance == 0) return METRO_ERROR_DARK_SEED;
+    return importance > 0 && isfinite(importance) ? METRO_OK : METRO_ERROR_BAD_SEED;
+}
+
+static void metroi_chain_begin(metro_chain *chain, double importance, double start_weight)
+{
+    metroi_chain_swap(chain, importance);
+    chain->weight = 0;
+    chain->start_weight = start_weight;
+    memset(&chain->counts, 0, sizeof chain->counts);
+}
+
+METRO_API metro_result metro_chain_start_point(metro_chain *chain, const double *z)
+{
+    const metro_target *target = &chain->target;
+    double importance;
+    metro_result result;
+    memmove(chain->tentative, z, metroi_state_doubles(target) * sizeof *z);
+    importance = target->importance(chain->tentative, chain->tentative_sample, target->user);
+    result = metroi_seed_check(importance);
+    if (result == METRO_OK) metroi_chain_begin(chain, importance, 1);
+    return result;
+}
+
+/* N seeds (paper (13)): the density of the start is a sum of spikes,
+
+       p_0(z) = sum_{i=1}^{N} alpha_i delta(z - z_i)                                                         (4.5) */
+
+static int metroi_weights_valid(const double *alpha, size_t count)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i;
+    for (i = 0; alpha != NULL && i < count; i++) {
+        if (!(alpha[i] >= 0)) return 0;
+        metro_sum_add(&sum, alpha[i]);
+    }
+    return count > 0 && (alpha == NULL || fabs(metro_sum_value(&sum) - 1) <= 1e-9);
+}
+
+METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double *z, const double *alpha, size_t seeds)
+{
+    const metro_target *target = &chain->target;
+    size_t doubles = metroi_state_doubles(target), chosen = 0, i;
+    double seen = 0;
+    if (!metroi_weights_valid(alpha, seeds)) return METRO_ERROR_ARGUMENT;
+    for (i = 0; i < seeds; i++) {
+        metro_result result;
+        double weight = alpha != NULL ? alpha[i] : 1;
+        result = metroi_seed_check(target->importance(z + i * doubles, chain->tentative_sample, target->user));
+        if (result != METRO_OK) return result;
+        /* Seed i replaces the one chosen so far with probability alpha_i / (alpha_1 + ... + alpha_i): eq 4.5 */
+        seen += weight;
+        if (weight > 0 && metro_rng_uniform(&chain->rng) * seen < weight) chosen = i;
+    }
+    return metro_chain_start_point(chain, z + chosen * doubles);
+}
+
+/* # 4.6 Veach's weighted seeds
+
+   Let x be drawn uniformly and give the whole run the weight I(x). Then, for every n and every h,
+
+       E[I(x) h(z_n)] = int I(z) h(z) dz                                                                     (4.6)
+
+   because the pair (state, weight) has the density of the target from the first step on, and the chain keeps it.
+   There is no start-up bias at all; the price is a factor I(x) that varies between runs. Choosing x from N draws in
+   proportion to I, with the mean of their importances as the weight, is unbiased too and varies less. The paper's
+   alpha_i in proportion to I(x_i) is the same choice without the weight, which leaves a bias of the order 1/N. If all
+   draws are dark, the weight is 0, and so is the estimate: that, too, belongs to the mean.
+
+   The candidates pass by once: each replaces the one kept so far with probability W_i / (W_1 + ... + W_i), which
+   leaves each in the end with probability proportional to W_i (Chao 1982). The importances are used in units of the
+   largest so far, so that their sum cannot overflow. */
+
+/* Evaluates a fresh uniform draw in the tentative buffers; what is no proper importance counts as 0. */
+static double metroi_chain_candidate(metro_chain *chain)
+{
+    const metro_target *target = &chain->target;
+    double importance;
+    metroi_state_draw(target, chain->tentative, &chain->rng);
+    importance = target->importance(chain->tentative, chain->tentative_sample, target->user);
+    importance = metroi_count_value(&chain->counts, importance);
+    metro_moments_add(&chain->normalisation, importance);
+    return importance;
+}
+
+METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t candidates)
+{
+    double sum = 0, unit = 0;
+    size_t i;
+    if (candidates == 0) return METRO_ERROR_ARGUMENT;
+    memset(&chain->counts, 0, sizeof chain->counts);
+    chain->importance = chain->weight = 0;
+    for (i = 0; i < candidates; i++) {
+        double importance = metroi_chain_candidate(chain);
+        if (importance > unit) {
+            sum *= unit / importance;
+            unit = importance;
+        }
+        if (!(importance > 0)) continue;
+        sum += importance / unit;
+        if (metro_rng_uniform(&chain->rng) * sum < importance / unit) metroi_chain_swap(chain, importance);
+    }
+    chain->start_weight = sum / (double)candidates * unit; /* eq 4.6 */
+    return unit > 0 ? METRO_OK : METRO_ERROR_NO_IMPORTANCE;
+}
+
+/* # 4.7 Burn-in and the normalisation
+
+   A burn-in throws the first samples away. Whether that pays is measured in chapter 5 and in the example `startup`:
+   it removes bias and variance's samples alike.
+
+   b is the mean importance of independent draws, wherever they come from: candidates, large steps, or a survey made
+   for it. */
+
+METRO_API void metro_chain_burn(metro_chain *chain, uint64_t steps)
+{
+    uint64_t i;
+    void (*record)(const void *, double, void *) = chain->target.record;
+    chain->target.record = NULL;
+    for (i = 0; i < steps; i++) metro_chain_step(chain);
+    chain->target.record = record;
+    chain->weight = 0;
+    memset(&chain->counts, 0, sizeof chain->counts);
+}
+
+METRO_API void metro_chain_survey(metro_chain *chain, uint64_t samples)
+{
+    uint64_t i;
+    for (i = 0; i < samples; i++) metroi_chain_candidate(chain);
+}
+
+METRO_API double metro_chain_b(const metro_chain *chain, double *error)
+{
+    if (error != NULL) *error = metro_moments_error(&chain->normalisation);
+    return metro_moments_mean(&chain->normalisation);
+}
+
+/* # 5 Start-up theory
+
+   A Metropolis chain needs no knowledge of its target to start, and pays for that at the start: its first samples lie
+   near the seed. How near, and for how long, can be said exactly in the case that the paper studies, where the
+   importance is constant and every tentative sample is accepted. The chain is then a sum of independent steps on a
+   circle, and Fourier series turn the sum into powers of numbers. This chapter follows the paper's equations (3) to
+   (17) in their order, corrects those that need it, and then evaluates each to twelve digits for every size of the
+   perturbation and every number of steps, which the series as it stands does not give: cut after 100 terms it is 5 %
+   low for Delta = .01 and n = 1, and at large n its terms underflow.
+
+   # 5.1 Steps add up
+
+   The circle has length 1; all lengths, sizes and seeds are fractions of it. The seed is z_0, and z_n, the state
+   after n steps, has the density p_n. With one seed at 0, p_0 is the point mass delta(x). The step from y to x has
+   the density P(x - y), even and wrapped around the circle (chapter 3). By the theorem of total probability
+
+       p_{n+1}(x) = int_{0}^{1} p_n(y) P(x - y) dy                                    (5.1)
+
+   This is paper (3) with two repairs. The transition inside the integral leads from y to x, P(y -> x), where the
+   paper prints P(x -> y). For an even kernel the two agree, but a kernel that steps to the right would, as printed,
+   send the chain to the left: ten steps of +.7 end at -7. And the integral runs over one period, with the wrapped
+   kernel, not over the whole line. The Fourier transform F turns this convolution into a product, which is paper (4):
+
+       F(p_{n+1}) = F(p_n) P*                                                         (5.2)
+
+   # 5.2 The series and the error
+
+   A density on the circle of length 1 is the sum of its harmonics,
+
+       p_n(x) = sum_{k=-inf}^{inf} a_k^{(n)} e^{2 pi i k x}
+       a_k^{(n)} = int_{0}^{1} p_n(x) e^{-2 pi i k x} dx                              (5.3)
+
+   Paper (5) writes e^{jkx} on [-pi, pi] here, and so do (9), (14) and (15); yet (10), (12) and (17) are those of a
+   circle of length 1. The two do not mix: on the circle of length 2 pi, after 3 steps of a uniform perturbation of
+   width 1, the L2 error is .625176, while (12) gives 1.567084, because it lacks a factor 1/sqrt(2 pi) there. We stay
+   with length 1. By eq 5.2 each coefficient is multiplied by its own number at each step, paper (6) and (7),
+
+       a_k^{(n+1)} = P*(k) a_k^{(n)}                                                  (5.4)
+
+   and since all coefficients of a point mass are 1, after n steps, paper (8) and (9),
+
+       p_n(x) = 1 + 2 sum_{k=1}^{inf} P*(k)^n cos(2 pi k x)                           (5.5)
+
+   The coefficient a_0 stays 1 for ever (eqs 5.3 and 5.4 at k = 0): it is the integral of p_n over the period. Paper
+   (11) writes it as 1/(2 pi) times an integral from -pi to pi, which is 1/(2 pi) for a density on that circle, not 1.
+   All others die away, so the chain tends to the uniform density. How far it still is from there, paper (10), is
+
+       E_n^2 = int_{0}^{1} (p_n(x) - 1)^2 dx                                          (5.6)
+
+   and Parseval's theorem turns eq 5.6 into paper (12), which is right as printed, on the unit period and for n >= 1:
+
+       E_n^2 = 2 sum_{k=1}^{inf} P*(k)^{2n}                                           (5.7)
+
+   At n = 0 all terms are 1 and the error is infinite. Comparing eq 5.7 with eq 5.5 at x = 0 we find that the squared
+   error is a value of a density, that of returning to the seed after twice as many steps:
+
+       E_n^2 = p_{2n}(0) - 1                                                          (5.8)
+
+   This holds for any reversible chain, with p_{2n}(x_0 -> x_0)/pi(x_0) in place of p_{2n}(0) (chapter 6), and it is
+   the key to this chapter. Everything below is a value of
+
+       e_s(x) = p_s(x) - 1                                                            (5.9)
+
+   which we call the excess: for s = 2n and x = 0, or for several s and x. Small sizes and few steps make its series
+   slow and the density easy; large sizes and many steps make the density flat and the series fast. We write it both
+   ways, and choose.
+
+   # 5.3 Numbers that outlive the double
+
+   After 100000 steps at Delta = .1 the error is about 1e-717, and no double holds it. We keep such a value as a
+   factor and a logarithm, $f e^g$, where g is 0 as long as there is no need for it. */
+
+typedef struct {
+    double factor, log; /* factor * exp(log); an exact zero has factor 0 */
+} metroi_scaled;
+
+static metroi_scaled metroi_scaled_make(double factor, double logarithm)
+{
+    metroi_scaled v;
+    v.factor = factor;
+    v.log = logarithm;
+    return v;
+}
+
+static double metroi_scaled_value(metroi_scaled v)
+{
+    return v.factor == 0 ? 0 : v.factor * exp(v.log);
+}
+
+/* The square root, and the logarithm of the square root. A square that rounding has pushed below zero is zero. */
+
+static double metroi_scaled_root(metroi_scaled v)
+{
+    return v.factor <= 0 ? 0 : sqrt(v.factor) * exp(0.5 * v.log);
+}
+
+static double metroi_scaled_root_log(metroi_scaled v)
+{
+    return v.factor <= 0 ? -METROI_INFINITY : 0.5 * (log(v.factor) + v.log);
+}
+
+/* ln abs(v) */
+static double metroi_scaled_log(metroi_scaled v)
+{
+    return v.factor == 0 ? -METROI_INFINITY : log(fabs(v.factor)) + v.log;
+}
+
+/* Adds factor e^logarithm to a sum that starts at (0, -infinity). The largest term sets the scale, whenever it comes.
+   */
+
+static void metroi_scaled_add(metroi_scaled *sum, double factor, double logarithm)
+{
+    if (factor == 0 || logarithm == -METROI_INFINITY) return;
+    if (logarithm > sum->log) {
+        sum->factor *= exp(sum->log - logarithm);
+        sum->log = logarithm;
+        sum->factor += factor;
+    } else {
+        sum->factor += factor * exp(logarithm - sum->log);
+    }
+}
+
+/* A power P^s is as good as ln P, and ln P is as good as the gap 1 - P where P is near 1. Chapter 3 gives both the
+   value and the gap of a mode, with arguments reduced without loss (eq 3.2), so ln abs(P) has a relative error of
+   some 1e-16 everywhere. Gaussian, Cauchy and von Mises modes we have as logarithms at once.
+
+   A spectrum is a kernel without its large steps on a circle of some length T, the period: its modes are those of the
+   line at the frequencies k/T. The von Mises kernel has no line, but from kappa = 1000 on chapter 3 has its modes as
+   a smooth function of k, and that is as good. Below, the modes that matter are tabled: exp(-s k^2/(2 kappa)) is
+   under 1e-18 at 300 for every s >= 2. */
+
+#define METROI_MODES 300
+#define METROI_SMOOTH_KAPPA 1000.0
+
+typedef struct {
+    metro_kernel kernel;
+    double period;
+    size_t known; /* how many of log_value are filled */
+    double log_value[METROI_MODES];
+} metroi_spectrum;
+
+static void metroi_spectrum_make(const metro_kernel *k, double period, metroi_spectrum *spectrum)
+{
+    spectrum->kernel = *k;
+    spectrum->kernel.large = 0;
+    spectrum->period = period;
+    spectrum->known = 0;
+    if (k->shape == METRO_VON_MISES && k->size < METROI_SMOOTH_KAPPA) {
+        spectrum->known = METROI_MODES;
+        metroi_von_mises_logs(k->size, METROI_MODES, spectrum->log_value);
+    }
+}
+
+/* ln abs(P(k/T)), and the sign of P. */
+static double metroi_spectrum_log(const metroi_spectrum *spectrum, double k, int *sign)
+{
+    double size = spectrum->kernel.size, f = k / spectrum->period, value, gap;
+    *sign = 1;
+    switch (spectrum->kernel.shape) {
+    case METRO_GAUSSIAN: return -2 * (METROI_PI * size * f) * (METROI_PI * size * f);
+    case METRO_CAUCHY: return -2 * METROI_PI * size * f;
+    case METRO_VON_MISES:
+        if (size >= METROI_SMOOTH_KAPPA) return metroi_bessel_log(0, f, size);
+        return k <= (double)spectrum->known ? spectrum->log_value[(size_t)k - 1] : -METROI_INFINITY;
+    case METRO_UNIFORM:
+    case METRO_TRIANGLE:
+    case METRO_KELEMEN: break;
+    }
+    metroi_kernel_mode(&spectrum->kernel, f, &value, &gap);
+    if (value < 0) *sign = -1;
+    return gap < 0.5 ? log1p(-gap) : log(fabs(value));
+}
+
+/* # 5.4 When to stop
+
+   A sum over modes stops where the terms not yet added cannot matter. We bound them, rather than wait for a small
+   term: the terms of a uniform kernel have zeros.
+
+   Uniform, h = Delta/T: abs(P(k/T)) <= 1/y with y = pi k h, and P <= exp(-y^2/6) before the first zero, so
+
+       sum_{j>k} abs(P_j)^s <= frac{k}{(s-1) y^s} "for" k h >= 1
+       sum_{j>k} abs(P_j)^s <= frac{3 k}{s y^2} e^{-s y^2/6} + pi^{-s} (1 + frac{1}{h (s-1)}) "below"      (5.10)
+
+   Kelemen: abs(P) <= C/f at the frequency f, with C = (1/s1 + 1/s2)/(2 pi L), since abs(Ci(x)) <= 1/x; from the
+   frequency C on this falls like the first line. That is late when s is large, and so we also want a bound X(f) on
+   all abs(P) from a lower f on. With a = 2 pi f s1 and b = 2 pi f s2, and V the variance of a step,
+
+       X(f) = frac{1}{L} (frac{1}{b} + max(.48, -ln a - .577 + a^2/4)) "or" C/f "where that is less"
+       X(f) = max(X(frac{1}{2 s2}), e^{-8 V f^2}) "for" f < frac{1}{2 s2}, V = frac{s2^2 - s1^2}{2 L}      (5.11)
+
+   The first line bounds Ci(b) by 1/b and Ci(a) by its series or, beyond its first zero, by its largest value. The
+   second is 1 - cos y >= 2 y^2/pi^2, true to y = pi. Up to the frequency 2 C there are at most 2 C T modes, none
+   above X.
+
+   For the other kernels ln P is concave in k: each ratio of neighbours is below the last one, and a geometric series
+   bounds the rest,
+
+       sum_{j>k} P_j^s <= P_k^s frac{r}{1 - r}, r = (P_k/P_{k-1})^s                   (5.12) */
+
+static double metroi_kelemen_bound(const metro_kernel *k)
+{
+    return (1 / k->size_min + 1 / k->size) / (2 * METROI_PI * metroi_kelemen_log(k->size_min, k->size));
+}
+
+static double metroi_sinc_tail(double h, double s, double k)
+{
+    double y = METROI_PI * k * h, near, far;
+    if (k * h >= 1) return log(k / (s - 1)) - s * log(y);
+    near = log(3 * k / (s * y * y)) - s * y * y / 6;
+    far = log1p(1 / (h * (s - 1))) - s * log(METROI_PI);
+    return log(2) + (near > far ? near : far); /* eq 5.10 */
+}
+
+/* ln X(f) */
+static double metroi_kelemen_ceiling(const metro_kernel *k, double f)
+{
+    double s1 = k->size_min, s2 = k->size, l = metroi_kelemen_log(s1, s2), g = fmax(f, 0.5 / s2);
+    double a = 2 * METROI_PI * g * s1, b = 2 * METROI_PI * g * s2;
+    double bell = -4 * (f * s2) * (f * s2 - f * s1 * (s1 / s2)) / l;
+    double ceiling = fmin(1 / b + fmax(0.48, -log(a) - 0.577 + 0.25 * a * a), 1 / a + 1 / b) / l;
+    return f < g ? fmax(bell, log(ceiling)) : log(ceiling); /* eq 5.11 */
+}
+
+static double metroi_kelemen_tail(const metro_kernel *k, double period, double s, double mode)
+{
+    double edge = 2 * metroi_kelemen_bound(k) * period, far = mode > edge ? mode : edge, near;
+    far = s * log(0.5 * edge / far) + log(far / (s - 1));
+    if (mode > edge) return far;
+    near = log(edge) + s * metroi_kelemen_ceiling(k, mode / period);
+    return log(2) + fmax(near, far);
+}
+
+/* The logarithm of the bound, where `at` and `before` are ln P_k and ln P_{k-1}. */
+static double metroi_spectrum_tail(const metroi_spectrum *spectrum, double s, double k, double at, double before)
+{
+    const metro_kernel *kernel = &spectrum->kernel;
+    double ratio = s * (at - before);
+    switch (kernel->shape) {
+    case METRO_UNIFORM: return metroi_sinc_tail(kernel->size / spectrum->period, s, k);
+    case METRO_TRIANGLE: return metroi_sinc_tail(kernel->size / 2 / spectrum->period, 2 * s, k);
+    case METRO_KELEMEN: return metroi_kelemen_tail(kernel, spectrum->period, s, k);
+    case METRO_GAUSSIAN:
+    case METRO_CAUCHY:
+    case METRO_VON_MISES: break;
+    }
+    if (at == -METROI_INFINITY) return at;
+    return s * at + ratio - log(-expm1(ratio)); /* eq 5.12 */
+}
+
+/* # 5.5 The sum over modes
+
+   One loop serves them all:
+
+       S = sum_{k=1}^{inf} P(k/T)^s w_k, w_k = cos(2 pi k x/T) "or" abs(A_k)^2        (5.13)
+
+   The weights are those of a point x, or those of a set of seeds (section 5.11). Beside S we keep S', the same sum of
+   abs(P)^s with all weights 1, which belongs to a single seed. We stop where the rest is below 1e-14 S. Seeds that
+   cancel each other make S so small that this may never come; so from 64 terms on 1e-14 sqrt(S S') is enough, which
+   holds the error of E_n below 1e-14 of what one seed has, and 1e-26 S' for seeds that cancel all. Bounds cost more
+   than terms; after the first 16 terms we look at every eighth.
+
+   For Kelemen's kernel at small s the terms fall slowly. After 50000 of them it has to be content with 1e-9, and
+   where ten times as many do not give that the answer is NaN. */
+
+#define METROI_PATIENCE 5e4
+
+typedef struct {
+    const double *point, *alpha; /* alpha NULL: equal weights */
+    size_t count;
+} metroi_seeds;
+
+static double metroi_seed_power(const metroi_seeds *seeds, double k);
+
+/* The logarithm of the tolerance at term k, relative to the sum. */
+static double metroi_series_tolerance(const metroi_spectrum *spectrum, double k)
+{
+    if (spectrum->kernel.shape != METRO_KELEMEN || k < METROI_PATIENCE) return log(1e-14);
+    return k < 10 * METROI_PATIENCE ? log(1e-9) : METROI_NAN;
+}
+
+static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, int odd, double x,
+                                   const metroi_seeds *seeds)
+{
+    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY), whole = sum;
+    double tolerance, at = 0, before, rest, weight, k;
+    int sign;
+    for (k = 1;; k++) {
+        before = at;
+        at = metroi_spectrum_log(spectrum, k, &sign);
+        weight = seeds != NULL ? metroi_seed_power(seeds, k) : metroi_cos_pi(2 * k, x / spectrum->period);
+        metroi_scaled_add(&sum, odd && sign < 0 ? -weight : weight, s * at); /* eq 5.13 */
+        metroi_scaled_add(&whole, 1, s * at);
+        if (k > 16 && fmod(k, 8) > 0) continue;
+        tolerance = metroi_series_tolerance(spectrum, k);
+        if (isnan(tolerance)) return metroi_scaled_make(tolerance, 0);
+        rest = metroi_spectrum_tail(spectrum, s, k, at, before);
+        if (rest <= tolerance + metroi_scaled_log(sum)) break;
+        if (k < 64) continue;
+        if (rest <= tolerance + 0.5 * (metroi_scaled_log(sum) + metroi_scaled_log(whole))) break;
+        if (rest <= log(1e-26) + metroi_scaled_log(whole)) break;
+    }
+    return sum;
+}
+
+/* # 5.6 A shorter circle
+
+   While the chain is still near its seed, the circle around it is mostly empty, and a shorter one would do. If p_s is
+   negligible beyond the distance r, its reach, then on a circle of length T = x + r no copy of p_s reaches x but its
+   own, and eq 5.5 on that circle, scaled back to the line, reads
+
+       p_s(x) = frac{1}{T} (1 + 2 sum_{k=1}^{inf} P(k/T)^s cos(2 pi k x/T)), x + r <= T <= 1      (5.14)
+
+   Its terms are spaced by 1/T, so there are fewer by the factor T. With the smallest T that is allowed, some twenty
+   terms are enough for every size and every number of steps.
+
+   The reach of s steps of at most c each is s c, and it is c + c sqrt(2 A s) up to a relative e^{-A}, by the bound of
+   Hoeffding (1963) on sums of bounded steps: the last step, whose density is bounded, brings the chain from within c
+   of x. For uniform steps of width g the variance g^2/12 takes the place of c^2 in that bound, because (sinh y)/y <=
+   exp(y^2/6); A = 48 gives
+
+       r = g min(s/2, 1/2 + sqrt{8 s})                                                (5.15)
+
+   Kelemen's density is unbounded by comparison, 1/(2 L s1), and A = 72 pays for that. A Gaussian of standard
+   deviation sigma sqrt(s) is left at 9.5 of them. A von Mises density of concentration kappa is nearly one with sigma
+   = 1/(2 pi sqrt(kappa)), with slightly more in its tail; 10 will do. The Cauchy density has no reach. */
+
+static double metroi_reach(const metro_kernel *k, double s)
+{
+    double c = k->size;
+    switch (k->shape) {
+    case METRO_UNIFORM: return c * (s < 33 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
+    case METRO_TRIANGLE: return 0.5 * c * (s < 16.5 ? s : 0.5 + sqrt(16 * s));
+    case METRO_GAUSSIAN: return 9.5 * c * sqrt(s);
+    case METRO_VON_MISES: return c < METROI_SMOOTH_KAPPA ? METROI_INFINITY : 10 * sqrt(s / c) / (2 * METROI_PI);
+    case METRO_KELEMEN: return c * (s < 146 ? s : 1 + 12 * sqrt(s));
+    case METRO_CAUCHY: break;
+    }
+    return METROI_INFINITY;
+}
+
+/* e_s(x) by modes, on the shorter circle where there is one; eq 5.9, 0 <= x <= 1/2. */
+static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int odd, double x)
+{
+    metroi_spectrum spectrum;
+    metroi_scaled sum;
+    double reach = metroi_reach(k, s), period = x + reach < 1 ? x + reach : 1;
+    if (x >= reach) return metroi_scaled_make(-1, 0);
+    metroi_spectrum_make(k, period, &spectrum);
+    sum = metroi_series(&spectrum, s, odd, x, NULL);
+    if (period < 1) return metroi_scaled_make((1 + 2 * metroi_scaled_value(sum)) / period - 1, 0); /* eq 5.14 */
+    sum.factor *= 2;
+    return sum;
+}
+
+/* # 5.7 Uniform perturbations
+
+   The tentative sample is uniform in an interval of width Delta around the current one,
+
+       P(x - y) = 1/Delta "for" abs(x - y) < Delta/2, "else" 0                        (5.16)
+
+   Paper (16) prints abs(x - y) < Delta, and that integrates to 2. Its transform, paper (17), is right, for Delta > 1
+   too:
+
+       P*(k) = frac{sin(pi k Delta)}{pi k Delta}                                      (5.17)
+
+   Size and steps. The first mode forgets last; -1/ln P*(1) steps reduce it by the factor e, and for small Delta that
+   is
+
+       tau = -frac{1}{ln P*(1)} ~ frac{6}{pi^2 Delta^2}                               (5.18)
+
+   The paper's section 2.3 asks for much more than 1/Delta steps, but a random walk covers distance by the square root
+   of its steps: after 10/Delta of them the error is still .27 for Delta = .1, 1.45 for .01 and 2.96 for .001.
+
+   Whole turns. A Delta that is a whole number lands uniformly in one step. Near such a Delta all coefficients are
+   small and 1 cancels from the density. Let m be the whole number nearest to Delta, d = Delta - m and g = abs(d) <=
+   1/2. Since sin(pi k Delta) = (-1)^{k m} sin(pi k d), the coefficients are those of a narrow kernel U_g, times
+   d/Delta, up to signs, and the signs are a shift by m/2:
+
+       e_s(x) = (d/Delta)^s e_s(U_g; x + s m/2)                                       (5.19)
+
+   In particular E_n(Delta) = (g/Delta)^n E_n(U_g), exactly 0 at d = 0, with all its digits beside it. It also means
+   that we need only sizes up to 1/2.
+
+   Few steps. The density of a sum of s uniform steps of width 1 is the B-spline B_s of order s, and wrapping it gives
+
+       p_s(U_g; x) = frac{1}{g} sum_{m} B_s((x - m)/g)                                (5.20)
+
+   Its explicit formula is an alternating sum, useless from s = 20 on. The recurrence adds positive numbers only (Cox
+   1972; de Boor 1972), centred:
+
+       B_s(y) = frac{(s/2 + y) B_{s-1}(y + 1/2) + (s/2 - y) B_{s-1}(y - 1/2)}{s - 1}
+       B_1(y) = 1 "for" abs(y) < 1/2, "and" 1/2 "at the ends"                         (5.21)
+
+   With eq 5.8 the first errors are E_1^2 = (1 - g)/g and E_2^2 = (2 - 3 g)/(3 g). Splines serve for s <= 10, and on
+   to 24 as long as the chain has not gone around the circle; then 1 does not cancel from p_s. Beyond, the modes decay
+   fast and eq 5.13 or eq 5.14 takes over. */
+
+#define METROI_SPLINE_ORDER 24
+
+static double metroi_spline(int order, double y)
+{
+    double b[METROI_SPLINE_ORDER], t;
+    int r, j;
+    /* the orders 1 of all arguments that will be needed, y + (order - 1)/2 down to y - (order - 1)/2 */
+    for (j = 0; j < order; j++) {
+        t = fabs(y + 0.5 * (order - 1) - j);
+        b[j] = t < 0.5 ? 1 : t > 0.5 ? 0 : 0.5;
+    }
+    for (r = 2; r <= order; r++) {
+        for (j = 0; j <= order - r; j++) {
+            t = y + 0.5 * (order - r) - j;
+            b[j] = ((0.5 * r + t) * b[j] + (0.5 * r - t) * b[j + 1]) / (r - 1); /* eq 5.21 */
+        }
+    }
+    return b[0];
+}
+
+/* e_s for a width g <= 1/2, at 0 <= x <= 1/2 */
+static metroi_scaled metroi_narrow_excess(double g, double s, int odd, double x)
+{
+    metro_kernel narrow;
+    double sum = 0, m;
+    if (s <= 10 || (s <= METROI_SPLINE_ORDER && s * g <= 1.5)) {
+        for (m = ceil(x - 0.5 * s * g); m <= x + 0.5 * s * g; m++) sum += metroi_spline((int)s, (x - m) / g);
+        return metroi_scaled_make((sum - g) / g, 0); /* eq 5.20 */
+    }
+    narrow.shape = METRO_UNIFORM;
+    narrow.size = g;
+    narrow.size_min = narrow.large = 0;
+    return metroi_excess_series(&narrow, s, odd, x);
+}
+
+/* ln(g/Delta) */
+static double metroi_turn_log(double size, double g)
+{
+    return g > size / 2 ? log1p((g - size) / size) : log(g / size);
+}
+
+static metroi_scaled metroi_uniform_excess(double size, double s, int odd, double x)
+{
+    double m = rint(size), d = size - m, g = fabs(d);
+    metroi_scaled e;
+    if (d == 0) return metroi_scaled_make(0, 0);
+    if (m == 0) return metroi_narrow_excess(g, s, odd, x);
+    e = metroi_narrow_excess(g, s, odd, odd && fmod(m, 2) > 0 ? 0.5 - x : x); /* eq 5.19 */
+    e.log += s * metroi_turn_log(size, g);
+    if (odd && d < 0) e.factor = -e.factor;
+    return e;
+}
+
+/* A triangular step of base Delta is the sum of two uniform steps of width Delta/2, so s triangular steps are 2 s
+   uniform ones:
+
+       e_s("triangle", Delta; x) = e_{2s}("uniform", Delta/2; x)                      (5.22)
+
+   # 5.8 Gaussian, Cauchy and von Mises perturbations
+
+   A Gaussian stays Gaussian, with the variance V = s sigma^2. Wide, it is its series; narrow, the sum of its images,
+   and the two agree by Poisson's formula:
+
+       e_s(x) = 2 sum_{k=1}^{inf} e^{-2 pi^2 V k^2} cos(2 pi k x)
+       e_s(x) = frac{1}{sqrt{2 pi V}} sum_{m=-inf}^{inf} e^{-(x-m)^2/(2V)} - 1        (5.23)
+
+   We change over at 2 pi^2 V = 1, where both need six terms. */
+
+static metroi_scaled metroi_gaussian_excess(double sigma, double s, double x)
+{
+    double deviation = sigma * sqrt(s), a = 2 * (METROI_PI * deviation) * (METROI_PI * deviation), sum = 0, k;
+    if (a > 1) {
+        sum = metroi_cos_pi(2, x);
+        for (k = 2; k <= 7; k++) sum += exp(-a * (k * k - 1)) * metroi_cos_pi(2 * k, x);
+        return metroi_scaled_make(2 * sum, -a); /* eq 5.23 */
+    }
+    for (k = -3; k <= 3; k++) sum += exp(-0.5 * ((x - k) / deviation) * ((x - k) / deviation));
+    return metroi_scaled_make(sum / (sqrt(2 * METROI_PI) * deviation) - 1, 0);
+}
+
+/* Cauchy steps add their scales, and with q = exp(-2 pi gamma s) the series is geometric:
+
+       e_s(x) = frac{2 q (cos(2 pi x) - q)}{(1 - q)^2 + 4 q sin^2(pi x)}
+       E_n^2 = frac{2}{e^{4 pi gamma n} - 1}                                          (5.24) */
+
+static metroi_scaled metroi_cauchy_excess(double gamma, double s, double x)
+{
+    double a = 2 * METROI_PI * gamma * s, q = exp(-a), gap = -expm1(-a);
+    double sine = sin(METROI_PI * x), t = sine * sine / gap;
+    return metroi_scaled_make(2 * (1 - 2 * t) / (gap + 4 * q * t), -a); /* eq 5.24 */
+}
+
+/* Von Mises steps on the circle do not stay von Mises; their coefficients I_k(kappa)/I_0(kappa) come from chapter 3,
+   and eq 5.13 adds them.
+
+   # 5.9 Kelemen's perturbations
+
+   The density 1/(2 L abs(u)) on s1 <= abs(u) <= s2, L = ln(s2/s1), has jumps that decay like 1/k in the spectrum. At
+   few steps we stay with densities. The density R of two steps on the line is elementary,
+
+       R(x) = frac{1}{2 L^2 x} (T + U), R(0) = frac{s2 - s1}{2 L^2 s1 s2}
+       T = ln(1 + frac{x - 2 s1}{s1}) "for" 2 s1 < x < s1 + s2
+       T = ln(1 + frac{2 s2 - x}{x - s2}) "for" s1 + s2 <= x < 2 s2, "else" 0
+       U = ln(1 + frac{x (s2 - s1 - x)}{s1 s2}) "for" x < s2 - s1, "else" 0           (5.25)
+
+   where T belongs to two steps in the same direction and U to opposite ones. Three and four steps are integrals over
+   R,
+
+       p_3(z) = int R(y) P(z - y) dy, p_4(z) = int R(y) R(z - y) dy                   (5.26)
+
+   whose integrands are smooth between the kinks at +-(0, 2 s1, s2 - s1, s1 + s2, 2 s2) and those of the other factor.
+   They change over lengths of the order of s1 beside a kink and more slowly away from it. So we cut each piece into
+   panels of length s1, 2 s1, 4 s1, ... inward from both ends and give each panel the 24-point Gauss rule. Five steps
+   and more are left to the series, on the short circle of eq 5.14, and so are four steps of a kernel that goes around
+   the circle many times. At two and three steps each turn is one term more; we stop at sizes of 10000, with NaN. */
+
+#define METROI_WIDEST 1e4
+
+static double metroi_kelemen_pair(const metro_kernel *k, double x)
+{
+    double s1 = k->size_min, s2 = k->size, l = metroi_kelemen_log(s1, s2), sum = 0;
+    x = fabs(x);
+    if (x == 0) return (s2 - s1) / s1 / (2 * l * l * s2);
+    if (x > 2 * s1 && x < 2 * s2) sum += x < s1 + s2 ? log1p((x - 2 * s1) / s1) : log1p((2 * s2 - x) / (x - s2));
+    if (x < s2 - s1) sum += log1p(x / s1 * ((s2 - s1 - x) / s2));
+    return sum / (2 * l * l * x); /* eq 5.25 */
+}
+
+/* The second factor of eq 5.26, for s = 3 and s = 4. */
+static double metroi_kelemen_factor(const metro_kernel *k, double s, double u)
+{
+    if (s > 3) return metroi_kelemen_pair(k, u);
+    u = fabs(u);
+    return u < k->size_min || u > k->size ? 0 : 1 / (2 * metroi_kelemen_log(k->size_min, k->size) * u);
+}
+
+static double metroi_kelemen_panel(const metro_kernel *k, double s, double z, double from, double to)
+{
+    double sum = 0, weight, y;
+    int i;
+    for (i = 0; i < 24; i++) {
+        y = from + (to - from) * metroi_gauss24(i, &weight);
+        sum += weight * metroi_kelemen_pair(k, y) * metroi_kelemen_factor(k, s, z - y);
+    }
+    return sum * (to - from);
+}
+
+/* One smooth piece: panels that double from both ends to the middle. */
+static double metroi_kelemen_piece(const metro_kernel *k, double s, double z, double from, double to)
+{
+    double middle = 0.5 * (from + to), half = middle - from, length = k->size_min, at = 0, next, sum = 0;
+    while (at < half) {
+        next = at + length < half ? at + length : half;
+        sum += metroi_kelemen_panel(k, s, z, from + at, from + next);
+        sum += metroi_kelemen_panel(k, s, z, to - next, to - at);
+        at = next;
+        length *= 2;
+    }
+    return sum;
+}
+
+/* p_3 or p_4 on the line, eq 5.26. */
+static double metroi_kelemen_line(const metro_kernel *k, double s, double z)
+{
+    double s1 = k->size_min, s2 = k->size, kink[20], place[5], sum = 0, low, high, t;
+    int count = 0, i, j;
+    place[0] = 0;
+    place[1] = 2 * s1;
+    place[2] = s2 - s1;
+    place[3] = s1 + s2;
+    place[4] = 2 * s2;
+    for (i = 0; i < 5; i++) {
+        kink[count++] = place[i];
+        kink[count++] = -place[i];
+        if (s < 4) place[i] = i % 2 ? s1 : s2;
+        kink[count++] = z + place[i];
+        kink[count++] = z - place[i];
+    }
+    for (i = 1; i < count; i++)
+        for (j = i; j > 0 && kink[j - 1] > kink[j]; j--) {
+            t = kink[j];
+            kink[j] = kink[j - 1];
+            kink[j - 1] = t;
+        }
+    low = fmax(-2 * s2, z - (s - 2) * s2);
+    high = fmin(2 * s2, z + (s - 2) * s2);
+    for (i = 1; i < count; i++)
+        if (kink[i] > kink[i - 1] && kink[i - 1] >= low && kink[i] <= high)
+            sum += metroi_kelemen_piece(k, s, z, kink[i - 1], kink[i]);
+    return sum;
+}
+
+static metroi_scaled metroi_kelemen_excess(const metro_kernel *k, double s, int odd, double x)
+{
+    double reach = s * k->size, m;
+    metro_sum sum = { -1, 0 };
+    if (s > 4 || (s > 3 && reach > 100 * metroi_kelemen_bound(k))) return metroi_excess_series(k, s, odd, x);
+    if (k->size > METROI_WIDEST) return metroi_scaled_make(METROI_NAN, 0);
+    for (m = ceil(x - reach); m <= x + reach; m++)
+        metro_sum_add(&sum, s > 2 ? metroi_kelemen_line(k, s, x - m) : metroi_kelemen_pair(k, x - m));
+    return metroi_scaled_make(metro_sum_value(&sum), 0);
+}
+
+/* # 5.10 Large steps
+
+   A kernel that is replaced, with probability p, by an independent uniform draw keeps its modes, times 1 - p (eq
+   3.1). So
+
+       e_s(x) = (1 - p)^s e_s(K; x), E_n = (1 - p)^n E_n(K)                           (5.27)
+
+   where K is the kernel alone: large steps forget at a rate that does not depend on the size. With that, the excess
+   of every kernel: s >= 2 steps, `odd` says whether s is odd, 0 <= x <= 1/2. */
+
+static metroi_scaled metroi_excess(const metro_kernel *k, double s, int odd, double x)
+{
+    metroi_scaled e = metroi_scaled_make(0, 0);
+    switch (k->shape) {
+    case METRO_UNIFORM: e = metroi_uniform_excess(k->size, s, odd, x); break;
+    case METRO_TRIANGLE: e = metroi_uniform_excess(0.5 * k->size, 2 * s, 0, x); break; /* eq 5.22 */
+    case METRO_GAUSSIAN: e = metroi_gaussian_excess(k->size, s, x); break;
+    case METRO_CAUCHY: e = metroi_cauchy_excess(k->size, s, x); break;
+    case METRO_VON_MISES: e = metroi_excess_series(k, s, odd, x); break;
+    case METRO_KELEMEN: e = metroi_kelemen_excess(k, s, odd, x); break;
+    }
+    if (k->large > 0) e.log += s * log1p(-k->large); /* eq 5.27 */
+    return e;
+}
+
+/* The cases that need no theory, in the order in which they are decided: NaN for what is no kernel, an infinite error
+   at n = 0, none where one step is uniform, and an infinite one for Kelemen's kernel of a single length, whose steps
+   lead from point to point. Sizes under 1e-100 are refused too: squares of their errors would leave the range of
+   doubles. Returns whether `square` has been set. */
+
+static int metroi_startup_settled(const metro_kernel *k, double n, metroi_scaled *square)
+{
+    double value, smallest = k->shape == METRO_KELEMEN ? k->size_min : k->size;
+    if (!metroi_kernel_valid(k) || (smallest > 0 && smallest < 1e-100)) value = METROI_NAN;
+    else if (n == 0) value = METROI_INFINITY;
+    else if (k->large == 1 || (k->shape == METRO_VON_MISES && k->size == 0)) value = 0;
+    else if (k->shape == METRO_KELEMEN && k->size_min == k->size) value = METROI_INFINITY;
+    else return 0;
+    *square = metroi_scaled_make(value, 0);
+    return 1;
+}
+
+/* E_n^2 */
+static metroi_scaled metroi_startup_square(const metro_kernel *k, uint64_t n)
+{
+    metroi_scaled square;
+    if (metroi_startup_settled(k, (double)n, &square)) return square;
+    return metroi_excess(k, 2 * (double)n, 0, 0); /* eq 5.8 */
+}
+
+METRO_API double metro_startup_error(const metro_kernel *k, uint64_t n)
+{
+    return metroi_scaled_root(metroi_startup_square(k, n));
+}
+
+METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
+{
+    return metroi_scaled_root_log(metroi_startup_square(k, n));
+}
+
+/* # 5.11 Many seeds
+
+   One way to reduce the start-up error is to start at one of several seeds x_i, chosen with the probability alpha_i,
+   paper (13):
+
+       p_0(x) = sum_{i=1}^{N} alpha_i delta(x - x_i), sum_{i=1}^{N} alpha_i = 1       (5.28)
+
+   The coefficients of p_0 are
+
+       A_k = sum_{i=1}^{N} alpha_i e^{-2 pi i k x_i}                                  (5.29)
+
+   and after n steps, paper (14) on the unit period,
+
+       p_n(x) = sum_{k=-inf}^{inf} P*(k)^n A_k e^{2 pi i k x} = sum_{i=1}^{N} alpha_i (1 + e_n(x - x_i))      (5.30)
+
+   Parseval's theorem gives the error:
+
+       E_n^2 = 2 sum_{k=1}^{inf} abs(P*(k))^{2n} abs(A_k)^2                           (5.31)
+
+   Paper (15) prints the seed sum inside the power, abs(P*(k) A_k)^{2n}. But the seeds act once, at the start, and the
+   kernel n times. With the weights .2, .3, .5 at 0, .25 and .6, Delta = .3 and n = 3 the true error is .202907, and
+   so says eq 5.31; the printed form says .022252. (The x that it leaves inside is harmless, since the modulus removes
+   it.)
+
+   N seeds at equal distances with equal weights leave only the multiples of N: all other A_k vanish. More a set of
+   seeds cannot do. It starts the chain better; it makes it forget no faster. To see such zeros the sums over seeds
+   must reduce k x_i exactly (eq 3.2): 1e-16 that is left of A_1 survives where P*(N)^n does not. */
+
+static double metroi_seed_weight(const metroi_seeds *seeds, size_t i)
+{
+    return seeds->alpha != NULL ? seeds->alpha[i] : 1 / (double)seeds->count;
+}
+
+/* abs(A_k)^2 */
+static double metroi_seed_power(const metroi_seeds *seeds, double k)
+{
+    double real = 0, imaginary = 0, turns, sine, cosine, alpha;
+    int quadrant;
+    size_t i;
+    for (i = 0; i < seeds->count; i++) {
+        turns = METROI_PI * metroi_turns(2 * k, seeds->point[i], &quadrant);
+        sine = sin(turns);
+        cosine = cos(turns);
+        alpha = metroi_seed_weight(seeds, i);
+        /* a quarter turn exchanges sine and cosine */
+        if (quadrant & 2) alpha = -alpha;
+        real += quadrant & 1 ? -alpha * sine : alpha * cosine;
+        imaginary += quadrant & 1 ? alpha * cosine : alpha * sine;
+    }
+    return real * real + imaginary * imaginary; /* eq 5.29 */
+}
+
+/* Seeds as a user gives them: some, all finite, with weights that are not negative and sum to 1. */
+static int metroi_seeds_valid(const metroi_seeds *seeds)
+{
+    double sum = 0;
+    size_t i;
+    if (seeds->point == NULL || seeds->count == 0) return 0;
+    for (i = 0; i < seeds->count; i++) {
+        double alpha = metroi_seed_weight(seeds, i);
+        if (!isfinite(seeds->point[i]) || !(alpha >= 0)) return 0;
+        sum += alpha;
+    }
+    return fabs(sum - 1) <= 1e-9;
+}
+
+/* The distance of two points on the circle, 0 .. 1/2. */
+static double metroi_circle_distance(double x, double y)
+{
+    double d = fabs(metroi_wrap(x) - metroi_wrap(y));
+    return d > 0.5 ? 1 - d : d;
+}
+
+/* For an even number of steps every case comes down to simpler ones, times a constant: triangular steps to uniform
+   ones (eq 5.22), a size to its distance from a whole number (eq 5.19, where the shift is by whole turns), large
+   steps to none (eq 5.27). Returns the logarithm of the constant; the size becomes 0 where nothing is left. */
+
+static double metroi_seeds_reduce(metro_kernel *kernel, double *s)
+{
+    double factor = kernel->large > 0 ? *s * log1p(-kernel->large) : 0, size;
+    kernel->large = 0;
+    if (kernel->shape == METRO_TRIANGLE) {
+        kernel->shape = METRO_UNIFORM;
+        kernel->size *= 0.5;
+        *s *= 2;
+    }
+    if (kernel->shape == METRO_UNIFORM && kernel->size > 0.5) {
+        size = kernel->size;
+        kernel->size = fabs(size - rint(size));
+        factor += *s * metroi_turn_log(size, kernel->size);
+    }
+    return factor;
+}
+
+/* At few steps the modes decay slowly, and the error is better had by eq 5.8, two seeds at a time,
+
+       E_n^2 = sum_{i,j} alpha_i alpha_j e_{2n}(x_i - x_j)                            (5.32)
+
+   This costs N^2 evaluations, and where seeds cancel modes it is a small difference of large terms. So it serves
+   where e_s is elementary, s <= 4, for uniform and Kelemen's steps, and for seeds so far apart that hardly any two
+   feel each other, which is where a series has millions of terms: if the reaches of n steps from all seeds together
+   cover at most half of the circle, the error of K is at least 1, and nothing cancels. For the Cauchy kernel we take
+   5 gamma s as the reach here, since its far tail is small against 1 then. */
+
+static int metroi_seeds_apart(const metro_kernel *k, double s, size_t count)
+{
+    double reach = k->shape == METRO_CAUCHY ? 5 * k->size * s : metroi_reach(k, s);
+    if (k->shape == METRO_UNIFORM || k->shape == METRO_KELEMEN) {
+        if (s <= 4) return 1;
+        if (k->shape == METRO_KELEMEN) return 0;
+    }
+    return reach < 0.01 && 4 * reach * (double)count <= 1;
+}
+
+static metroi_scaled metroi_seeds_pairs(const metro_kernel *k, double s, const metroi_seeds *seeds)
+{
+    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY), e = metroi_excess(k, s, 0, 0);
+    size_t i, j;
+    for (i = 0; i < seeds->count; i++) {
+        double alpha = metroi_seed_weight(seeds, i);
+        metroi_scaled_add(&sum, alpha * alpha * e.factor, e.log);
+    }
+    for (i = 1; i < seeds->count; i++)
+        for (j = 0; j < i; j++) {
+            double alpha = metroi_seed_weight(seeds, i) * metroi_seed_weight(seeds, j);
+            e = metroi_excess(k, s, 0, metroi_circle_distance(seeds->point[i], seeds->point[j]));
+            metroi_scaled_add(&sum, 2 * alpha * e.factor, e.log); /* eq 5.32 */
+        }
+    return sum;
+}
+
+static metroi_scaled metroi_seeds_square(const metro_kernel *k, uint64_t n, const metroi_seeds *seeds)
+{
+    metro_kernel kernel = *k;
+    metroi_spectrum spectrum;
+    metroi_scaled square;
+    double s = 2 * (double)n, factor;
+    if (!metroi_seeds_valid(seeds)) return metroi_scaled_make(METROI_NAN, 0);
+    if (metroi_startup_settled(k, (double)n, &square)) return square;
+    factor = metroi_seeds_reduce(&kernel, &s);
+    if (kernel.size == 0) return metroi_scaled_make(0, 0);
+    if (seeds->count == 1 || metroi_seeds_apart(&kernel, s, seeds->count)) {
+        square = metroi_seeds_pairs(&kernel, s, seeds);
+    } else {
+        metroi_spectrum_make(&kernel, 1, &spectrum);
+        square = metroi_series(&spectrum, s, 0, 0, seeds);
+        square.factor *= 2; /* eq 5.31 */
+    }
+    square.log += factor;
+    return square;
+}
+
+static metroi_seeds metroi_seeds_make(const double *point, const double *alpha, size_t count)
+{
+    metroi_seeds seeds;
+    seeds.point = point;
+    seeds.alpha = alpha;
+    seeds.count = count;
+    return seeds;
+}
+
+METRO_API double metro_startup_error_seeds(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha,
+                                           size_t seeds)
+{
+    metroi_seeds set = metroi_seeds_make(seed, alpha, seeds);
+    return metroi_scaled_root(metroi_seeds_square(k, n, &set));
+}
+
+METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n, const double *seed,
+                                               const double *alpha, size_t seeds)
+{
+    metroi_seeds set = metroi_seeds_make(seed, alpha, seeds);
+    return metroi_scaled_root_log(metroi_seeds_square(k, n, &set));
+}
+
+/* # 5.12 The interval
+
+   Between reflecting ends the natural functions are cosines, 1 and sqrt(2) cos(pi k x), and they are multiplied at
+   each step by mu_k, the transform of the kernel at the frequency k/2. So
+
+       E_n^2(x_0) = 2 sum_{k=1}^{inf} mu_k^{2n} cos^2(pi k x_0)                       (5.33)
+
+   By eq 5.33 the ends are the worst seeds. Unfolded, the interval is a circle of length 2 with the seeds x_0 and
+   -x_0; scaled back to length 1, and turned, these are two seeds of weight 1/2 at the distance x_0 under the kernel
+   at half its size:
+
+       E_n(x_0) = E_n("circle, half the size, seeds" 0 "and" x_0 "of weight" 1/2)     (5.34)
+
+   because abs(A_k)^2 = cos^2(pi k x_0). From the middle, x_0 = 1/2, the odd modes vanish and the even ones are those
+   of the circle of length 1 with the kernel as it is. */
+
+static metroi_scaled metroi_reflect_square(const metro_kernel *k, double x0, uint64_t n)
+{
+    double point[2] = { 0, 0 };
+    metro_kernel half = *k;
+    metroi_seeds seeds = metroi_seeds_make(point, NULL, 2);
+    if (k->shape == METRO_VON_MISES || !isfinite(x0)) return metroi_scaled_make(METROI_NAN, 0);
+    if (fabs(x0 - rint(x0)) == 0.5) return metroi_startup_square(k, n);
+    half.size *= 0.5;
+    half.size_min *= 0.5;
+    point[1] = x0;
+    return metroi_seeds_square(&half, n, &seeds); /* eq 5.34 */
+}
+
+METRO_API double metro_reflect_startup_error(const metro_kernel *k, double x0, uint64_t n)
+{
+    return metroi_scaled_root(metroi_reflect_square(k, x0, n));
+}
+
+METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x0, uint64_t n)
+{
+    return metroi_scaled_root_log(metroi_reflect_square(k, x0, n));
+}
+
+/* # 5.13 More dimensions
+
+   The paper says of Figure 2 that the situation gets worse for higher dimensions. It does, and we can say by how
+   much. If a step perturbs all d coordinates at once and independently, the density of the state is the product of
+   those of its coordinates, and with e_j the start-up error of coordinate j
+
+       1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.35)
+
+   While the e_j are large, the error grows like their product; when they are small, only like sqrt(d). We evaluate eq
+   5.35 in logarithms:
+
+       E_n^2 = exp(sum_{j=1}^{d} ln(1 + e_j^2)) - 1                                   (5.36)
+
+   A step that perturbs only one coordinate, picked at random, is another matter. Its eigenvalues are 1 - (1/d) sum_j
+   (1 - P*(k_j)), and with probability (1 - 1/d)^n a given coordinate has not been touched after n steps: p_n keeps a
+   part that is concentrated on a line, and for d >= 2 its L2 error is infinite for every n. Taking the coordinates in
+   turn makes it finite after a full sweep. The library computes neither. */
+
+static metroi_scaled metroi_axes_square(const metro_kernel *k, size_t axes, uint64_t n)
+{
+    metroi_scaled small = metroi_scaled_make(0, -METROI_INFINITY), e;
+    double sum = 0;
+    size_t i;
+    if (axes == 0) return metroi_scaled_make(METROI_NAN, 0);
+    for (i = 0; i < axes; i++) {
+        e = metroi_startup_square(&k[i], n);
+        if (isnan(e.factor)) return e;
+        metroi_scaled_add(&small, e.factor, e.log);
+        sum += log1p(metroi_scaled_value(e));
+    }
+    if (sum < 1e-17) return small;
+    if (sum < 1) return metroi_scaled_make(expm1(sum), 0); /* eq 5.36 */
+    return sum < METROI_INFINITY ? metroi_scaled_make(-expm1(-sum), sum) : metroi_scaled_make(sum, 0);
+}
+
+METRO_API double metro_startup_error_axes(const metro_kernel *k, size_t axes, uint64_t n)
+{
+    return metroi_scaled_root(metroi_axes_square(k, axes, n));
+}
+
+METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes, uint64_t n)
+{
+    return metroi_scaled_root_log(metroi_axes_square(k, axes, n));
+}
+
+/* # 5.14 The running mean
+
+   A picture averages all samples so far. A sample picked at random among the M after a burn-in of b - 1 has the
+   density (p_b + .. + p_{b+M-1})/M, and by eq 5.5 its coefficients are geometric sums:
+
+       S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.37)
+       E^2 = 2 sum_{k=1}^{inf} S_k^2                                                  (5.38)
+
+   For a mode with P near 1 this dies like tau/M, by averaging, while P^n dies exponentially; section 5.18 says what
+   that means for an estimate. For M = 1 it is E_b again. With b = 0 the mean holds p_0, and its error is infinite.
+
+   At b = 1 the series is slow, like 1/k^2 for uniform steps. Squaring eq 5.37 out gives powers of P again,
+
+       M^2 S_k^2 = sum_{s=2b}^{2(b+M-1)} c_s P*(k)^s, c_s = min(s - 2b + 1, 2(b+M-1) - s + 1)      (5.39)
+
+   and each power, summed over k, is a value e_s(0) that we know how to find. So the first powers, which make the
+   series slow, are taken out of it:
+
+       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + 2 sum_{k=1}^{inf} G_k
+       G_k = M^2 S_k^2 - sum_{s=2b}^{J} c_s P*(k)^s                                   (5.40)
+
+   Uniform steps: J = 16, triangular ones: J = 8, Kelemen's: J = 4. Where J would be under 2b nothing is taken out. On
+   a shorter circle, which must hold the reach of 2(b+M-1) steps, the mode k = 0 does not drop out and all is divided
+   by T, as in eq 5.14:
+
+       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + frac{1}{T} (G_0 + 2 sum_{k=1}^{inf} G_k) - G_0      (5.41)
+
+   With large steps everything carries (1 - p)^s; we keep (1 - p)^{2b} in front and the rest inside. */
+
+typedef struct {
+    const metro_kernel *kernel;
+    double burn, steps, keep; /* b, M, and 1 - p */
+    int odd_steps;
+    double last;              /* J - 2b: so many powers, and one, are taken out; -1: none */
+} metroi_mean;
+
+/* c_s as a function of i = s - 2b */
+static double metroi_mean_weight(const metroi_mean *mean, double i)
+{
+    return i + 1 < 2 * mean->steps - 1 - i ? i + 1 : 2 * mean->steps - 1 - i;
+}
+
+/* The powers s = 2b + i, i = 0 .. last. `ratio` bounds abs(e_{s+1}/e_s): where it makes terms negligible, the sum
+   ends. */
+static metroi_scaled metroi_mean_powers(const metroi_mean *mean, double last, double ratio)
+{
+    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY), e;
+    double i, c;
+    for (i = 0; i <= last && i <= 2 * (mean->steps - 1); i++) {
+        c = metroi_mean_weight(mean, i);
+        if ((i + 1) * pow(ratio, i) < 1e-17) break;
+        e = metroi_excess(mean->kernel, 2 * mean->burn + i, fmod(i, 2) > 0, 0);
+        metroi_scaled_add(&sum, c * e.factor, e.log); /* eq 5.39 */
+    }
+    return sum;
+}
+
+/* sum_{i=0}^{last} c_i v^i, the part of G that is taken out, over P^{2b} */
+static double metroi_mean_polynomial(const metroi_mean *mean, double v)
+{
+    double sum = 0, i = mean->last;
+    if (i > 2 * (mean->steps - 1)) i = 2 * (mean->steps - 1);
+    for (; i >= 0; i--) sum = sum * v + metroi_mean_weight(mean, i);
+    return sum;
+}
+
+/* (1 - v^M)/(1 - v) for v = (1 - p) P with ln abs(P) = `at`; 1 - v is carried as the gap. */
+static double metroi_mean_geometric(const metroi_mean *mean, double at, int sign, double *v)
+{
+    double gap, power;
+    *v = sign * mean->keep * exp(at);
+    gap = sign > 0 ? (1 - mean->keep) - mean->keep * expm1(at) : 1 - *v;
+    if (gap == 0) return mean->steps;
+    if (*v > 0.5) return -expm1(mean->steps * log1p(-gap)) / gap;
+    power = exp(mean->steps * (at + log(mean->keep)));
+    return (sign < 0 && mean->odd_steps ? 1 + power : 1 - power) / gap;
+}
+
+/* The tails. Gaussian and von Mises modes: 1 - P grows at most like k^2, so P^b/(1 - P) falls faster than 1/k^2 and
+   the terms faster than 1/k^4; for Cauchy modes it is 1/k and 1/k^2:
+
+       sum_{j>k} G_j <= frac{k}{3} (frac{P_k^b}{(1-p)(1 - P_k)})^2, "Cauchy" k "for" k/3      (5.42)
+
+   Uniform and triangular modes obey the first up to the first zero of P, and from there on, as Kelemen's do from the
+   start, with a bound abs(P) <= x on all modes from k on, x falling like 1/k, 1/k^2 and 1/k,
+
+       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.43) */
+
+static double metroi_mean_tail(const metroi_mean *mean, const metroi_spectrum *spectrum, double k, double at)
+{
+    const metro_kernel *kernel = mean->kernel;
+    double near = -METROI_INFINITY, far = near, power = 2 * mean->burn + mean->last, h = 0, x, falls = power;
+    switch (kernel->shape) {
+    case METRO_UNIFORM: h = kernel->size / spectrum->period; break;
+    case METRO_TRIANGLE: h = kernel->size / 2 / spectrum->period; break;
+    case METRO_KELEMEN: break;
+    case METRO_GAUSSIAN:
+    case METRO_CAUCHY:
+    case METRO_VON_MISES: h = -1; break;
+    }
+    if (h < 0 || (h > 0 && k * h < 1)) {
+        near = log(kernel->shape == METRO_CAUCHY ? k : k / 3);
+        near += 2 * (mean->burn * at - log(-mean->keep * expm1(at)));
+    }
+    if (h < 0) return near; /* eq 5.42 */
+    if (k * h < 1 && h > 0) k = 1 / h;
+    if (h == 0 && (x = 4 * metroi_kelemen_bound(kernel) * spectrum->period) > k) {
+        near = metroi_kelemen_ceiling(kernel, k / spectrum->period);
+        near = near < 0 ? log(x) + 2 * (mean->burn * near - log(-expm1(near))) : METROI_INFINITY;
+        k = x;
+    }
+    x = h > 0 ? 1 / (METROI_PI * k * h) : metroi_kelemen_bound(kernel) * spectrum->period / k;
+    if (kernel->shape == METRO_TRIANGLE) {
+        x *= x;
+        falls = 2 * power + 1;
+    }
+    if (!(x < 0.5)) return METROI_INFINITY;
+    far = (power + 1) * log(x) + log(k / falls); /* eq 5.43 */
+    far += log((mean->last + 2) / (1 - x) + x / ((1 - x) * (1 - x)));
+    return log(2) + (near > far ? near : far);
+}
+
+/* The series of eq 5.41 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
+   reach counts the steps whose weight (1 - p)^s is above e^{-45} only. */
+
+static metroi_scaled metroi_mean_modes(const metroi_mean *mean, double taken)
+{
+    metroi_spectrum spectrum;
+    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY);
+    double longest = 2 * (mean->steps - 1), fade = -45 / log(mean->keep), reach, zero = 0, at, r, v, k;
+    double total, rest, tolerance;
+    int sign;
+    if (mean->keep < 1 && fade < longest) longest = fade;
+    reach = metroi_reach(mean->kernel, 2 * mean->burn + longest);
+    metroi_spectrum_make(mean->kernel, reach < 1 ? reach : 1, &spectrum);
+    if (reach < 1) {
+        r = metroi_mean_geometric(mean, 0, 1, &v);
+        zero = r * r - metroi_mean_polynomial(mean, mean->keep);
+        taken += log(reach);
+        if (log(zero) > taken) taken = log(zero);
+    }
+    for (k = 1;; k++) {
+        at = metroi_spectrum_log(&spectrum, k, &sign);
+        r = metroi_mean_geometric(mean, at, sign, &v);
+        metroi_scaled_add(&sum, r * r - metroi_mean_polynomial(mean, v), 2 * mean->burn * at); /* eq 5.40 */
+        if (k > 16 && fmod(k, 8) > 0) continue;
+        tolerance = metroi_series_tolerance(&spectrum, k) - log(10);
+        if (isnan(tolerance)) return metroi_scaled_make(tolerance, 0);
+        total = metroi_scaled_log(sum);
+        rest = metroi_mean_tail(mean, &spectrum, k, at);
+        if (rest <= tolerance + (total > taken ? total : taken)) break;
+        if (at == -METROI_INFINITY && mean->kernel->shape == METRO_VON_MISES) break;
+    }
+    sum.factor *= 2;
+    if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.41 */
+    return sum;
+}
+
+/* Cauchy modes fall slowly when gamma b is small, and their powers sum slowly when M is large; but as a function of
+   s, c_s e_s(0) is smooth. We add 1024 powers one by one, and the rest by Euler and Maclaurin's formula at midpoints,
+
+       sum_{i=u}^{v-1} g(i) = int_{u-1/2}^{v-1/2} g(t) dt - frac{1}{24} (g'(v - 1/2) - g'(u - 1/2)) + ...      (5.44)
+
+   over panels that double in length, 24 Gauss points in each, the derivative taken as g(v) - g(v-1). What is left out
+   is of the order of g'''/2000, and g changes over 1000 steps or more. c_s rises for i < M and falls from there; each
+   slope is a sum of its own. */
+
+static double metroi_cauchy_power(const metroi_mean *mean, double i, int falling)
+{
+    double rate = 2 * METROI_PI * mean->kernel->size;
+    double c = falling ? 2 * mean->steps - 1 - i : i + 1;
+    return c * 2 / expm1(rate * (2 * mean->burn + i)) * (mean->keep < 1 ? pow(mean->keep, i) : 1);
+}
+
+static double metroi_cauchy_slope(const metroi_mean *mean, double from, double to, int falling)
+{
+    double sum = 0, i, end, weight, node, slope, panel;
+    int j;
+    for (i = from; i < to && i < from + 1024; i++) sum += metroi_cauchy_power(mean, i, falling);
+    while (i < to) {
+        end = 2 * i < to ? 2 * i : to;
+        panel = 0;
+        for (j = 0; j < 24; j++) {
+            node = metroi_gauss24(j, &weight);
+            panel += weight * metroi_cauchy_power(mean, i - 0.5 + (end - i) * node, falling);
+        }
+        slope = metroi_cauchy_power(mean, end, falling) - metroi_cauchy_power(mean, end - 1, falling)
+              - metroi_cauchy_power(mean, i, falling) + metroi_cauchy_power(mean, i - 1, falling);
+        sum += panel * (end - i) - slope / 24; /* eq 5.44 */
+        i = end;
+    }
+    return sum;
+}
+
+static metroi_scaled metroi_mean_cauchy(const metroi_mean *mean)
+{
+    double rate = 2 * METROI_PI * mean->kernel->size, end = ceil(45 / (rate - log(mean->keep)));
+    double top = mean->steps, sum;
+    sum = metroi_cauchy_slope(mean, 0, end < top ? end : top, 0);
+    if (end > 2 * top - 1) end = 2 * top - 1;
+    if (end > top) sum += metroi_cauchy_slope(mean, top, end, 1);
+    return metroi_scaled_make(sum, 2 * mean->burn * log(mean->keep));
+}
+
+/* M^2 E^2. Close to a whole number of turns the powers of d/Delta fall so fast that they are all we need; the Cauchy
+   kernel goes its own way while 4 pi gamma b < 1. */
+
+static metroi_scaled metroi_mean_sum(metroi_mean *mean)
+{
+    const metro_kernel *k = mean->kernel;
+    double size = k->shape == METRO_TRIANGLE ? 0.5 * k->size : k->size, ratio = 1;
+    double highest = 0;
+    metroi_scaled sum, modes;
+    if (k->shape == METRO_UNIFORM) highest = 16;
+    if (k->shape == METRO_TRIANGLE) highest = 8;
+    if (k->shape == METRO_KELEMEN) highest = 4;
+    if (highest > 4) {
+        ratio = fabs(size - rint(size)) / size;
+        if (k->shape == METRO_TRIANGLE) ratio *= ratio;
+    }
+    if (ratio < 1 && ratio * mean->keep < 0.1) return metroi_mean_powers(mean, METROI_INFINITY, ratio * mean->keep);
+    if (k->shape == METRO_CAUCHY && 4 * METROI_PI * k->size * mean->burn < 1) return metroi_mean_cauchy(mean);
+    mean->last = highest >= 2 * mean->burn ? highest - 2 * mean->burn : -1;
+    sum = metroi_mean_powers(mean, mean->last, 1);
+    if (mean->last >= 2 * (mean->steps - 1)) return sum;
+    sum.log -= 2 * mean->burn * log(mean->keep);
+    modes = metroi_mean_modes(mean, metroi_scaled_log(sum));
+    metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.40 */
+    sum.log += 2 * mean->burn * log(mean->keep);
+    return sum;
+}
+
+static metroi_scaled metroi_mean_square(const metro_kernel *k, uint64_t burn, uint64_t steps)
+{
+    metroi_mean mean;
+    metroi_scaled square;
+    if (steps == 0) return metroi_scaled_make(METROI_NAN, 0);
+    if (metroi_startup_settled(k, (double)burn, &square)) return square;
+    if (steps == 1) return metroi_startup_square(k, burn);
+    mean.kernel = k;
+    mean.burn = (double)burn;
+    mean.steps = (double)steps;
+    mean.keep = 1 - k->large;
+    mean.odd_steps = (int)(steps & 1);
+    mean.last = -1;
+    square = metroi_mean_sum(&mean);
+    square.factor /= mean.steps * mean.steps; /* eq 5.38 */
+    return square;
+}
+
+METRO_API double metro_startup_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps)
+{
+    return metroi_scaled_root(metroi_mean_square(k, burn, steps));
+}
+
+METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps)
+{
+    return metroi_scaled_root_log(metroi_mean_square(k, burn, steps));
+}
+
+/* # 5.15 The density itself
+
+   p_n(x) is eq 5.30 term by term. At n = 1 it is the kernel's own density, with its jumps; from n = 2 on it is
+   continuous. Rounding can leave a value of -1e-16 where the density is 0; it is returned as 0. */
+
+static double metroi_startup_density_one(const metro_kernel *k, uint64_t n, double x, double seed)
+{
+    metroi_scaled e;
+    if (n == 0) return metroi_wrap(x) == metroi_wrap(seed) ? METROI_INFINITY : 0;
+    if (n == 1) return metro_kernel_density(k, seed, x);
+    if (metroi_startup_settled(k, (double)n, &e)) return e.factor == 0 ? 1 : METROI_NAN;
+    e = metroi_excess(k, (double)n, (int)(n & 1), metroi_circle_distance(x, seed));
+    return 1 + metroi_scaled_value(e);
+}
+
+METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
+                                       const double *alpha, size_t seeds)
+{
+    metroi_seeds set = metroi_seeds_make(seed, alpha, seeds);
+    double sum = 0;
+    size_t i;
+    if (!metroi_kernel_valid(k) || !isfinite(x) || !metroi_seeds_valid(&set)) return METROI_NAN;
+    for (i = 0; i < seeds; i++) {
+        double weight = metroi_seed_weight(&set, i);
+        if (weight > 0) sum += weight * metroi_startup_density_one(k, n, x, seed[i]); /* eq 5.30 */
+    }
+    return sum < 0 ? 0 : sum;
+}
+
+/* # 5.16 Other distances
+
+   The paper measures the error in L2. A probabilist would ask for the total variation, the largest error of the
+   probability of any event; a statistician for the Kullback-Leibler divergence:
+
+       TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.45)
+
+   Both are bounded by the L2 error, by the inequalities of Cauchy and Schwarz and of Jensen:
+
+       TV <= min(1, E_n/2)                                                            (5.46)
+       KL <= ln(1 + E_n^2)                                                            (5.47)
+
+   For a uniform kernel at n = 1 the density has two values. With f = Delta - floor(Delta), it is 1 + q u, u = (1 -
+   f)/Delta, on a part f of the circle, and 1 + q v, v = -f/Delta, on the rest, where q = 1 - p is what large steps
+   leave. So
+
+       TV = q f (1 - f)/Delta                                                         (5.48)
+       KL = f phi(q u) + (1 - f) phi(q v), phi(t) = (1 + t) ln(1 + t) - t             (5.49)
+
+   and the t in phi, which cancel in the sum, keep its digits where the values of t are small; below 1/8 phi is summed
+   as t^2/2 - t^3/6 + t^4/12 - ... */
+
+static double metroi_divergence_phi(double t)
+{
+    double sum = 0, j;
+    if (t <= -1) return 1;
+    if (fabs(t) > 0.125) return (1 + t) * log1p(t) - t;
+    for (j = 18; j >= 2; j--) sum = 1 / (j * (j - 1)) - t * sum;
+    return t * t * sum;
+}
+
+static int metroi_startup_two_valued(const metro_kernel *k, uint64_t n)
+{
+    return metroi_kernel_valid(k) && k->shape == METRO_UNIFORM && n == 1;
+}
+
+METRO_API double metro_startup_total_variation(const metro_kernel *k, uint64_t n)
+{
+    double f = k->size - floor(k->size), e;
+    if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.48 */
+    e = metro_startup_error(k, n);
+    return e > 2 ? 1 : 0.5 * e; /* eq 5.46 */
+}
+
+METRO_API double metro_startup_divergence(const metro_kernel *k, uint64_t n)
+{
+    double f = k->size - floor(k->size), q = 1 - k->large, e;
+    if (metroi_startup_two_valued(k, n)) {
+        double above = q * ((1 - f) / k->size), below = -q * (f / k->size);
+        return f * metroi_divergence_phi(above) + (1 - f) * metroi_divergence_phi(below); /* eq 5.49 */
+    }
+    e = metro_startup_error(k, n);
+    return log1p(e * e); /* eq 5.47 */
+}
+
+#undef METROI_MODES
+#undef METROI_PATIENCE
+#undef METROI_SMOOTH_KAPPA
+#undef METROI_SPLINE_ORDER
+#undef METROI_WIDEST
+
+/* # 5.17 The sphere
+
+   A state may be a direction, and the paper perturbs directions inside a cone. Spherical harmonics play the part of
+   the Fourier series: a kernel that depends on the angle alone multiplies all 2l + 1 harmonics of degree l by
+   lambda_l (chapter 3). Against the uniform probability on the sphere, with p_n the density relative to it,
+
+       E_n^2 = sum_{l=1}^{inf} (2l + 1) lambda_l^{2n} = p_{2n}(0) - 1                 (5.50)
+
+   where p_{2n}(0) is the density of being back at the seed. The factor 2l + 1 is the price of a second dimension: for
+   a small cone some 1/alpha^2 modes wait to be forgotten, not 1/Delta.
+
+   One and two steps have closed forms. Let f = sin^2(alpha/2) be the share of the sphere that the cone takes; then
+   p_2(0) = 1/f, and
+
+       E_1 = cot(alpha/2)                                                             (5.51)
+
+   For E_2 we need p_2 everywhere: at an angle theta from the seed it is the share of the sphere in which two cones,
+   theta apart, overlap, over f^2. The overlap is elementary, two sectors less two triangles. With sin(theta/2) =
+   sin(alpha) sin(t),
+
+       f p_2 = frac{2}{pi} (atan2(cos(t), cos(alpha) sin(t)) - frac{1}{2 f} asin(A)),
+       A = frac{2 f cos(t) sin(t)}{sqrt{1 - sin^2(alpha) sin^2(t)}}                   (5.52)
+       1 + E_2^2 = 2 sin^2(alpha) int_{0}^{pi/2} p_2^2 sin(t) cos(t) dt               (5.53)
+
+   and the variable t makes the integrand so smooth that 24 Gauss points give it to rounding. The value is f (1 +
+   E_2^2). */
+
+static double metroi_cone_twice(double f)
+{
+    double cosine = 1 - 2 * f, sine = 2 * sqrt(f * (1 - f)), sum = 0, weight, s, c, p;
+    int i;
+    for (i = 0; i < 24; i++) {
+        double t = 0.5 * METROI_PI * metroi_gauss24(i, &weight);
+        s = sin(t);
+        c = cos(t);
+        p = 2 / METROI_PI * (atan2(c, cosine * s) - asin(2 * f * c * s / sqrt(1 - sine * s * (sine * s))) / (2 * f));
+        sum += weight * p * p * s * c; /* eq 5.52 */
+    }
+    return 4 * METROI_PI * (1 - f) * sum; /* eq 5.53: sin^2(alpha) = 4 f (1 - f) */
+}
+
+/* From three steps on we sum eq 5.50 relative to its first term, with the recurrence of section 3.10. Its terms fall
+   in the end like those of a Bessel function,
+
+       abs(lambda_l) <= C_b (l + 1/2)^{-3/2}, C_b = 1.16 (1 + cos(alpha)) sqrt{2/pi} sin^{-3/2}(alpha)      (5.54)
+
+   (the form is the asymptotic one, Szego 1939, 8.21; the factor 1.16 was found numerically over all degrees and
+   angles, 1.151 being needed), so what follows degree l is at most 2 C_b^{2n} (l + 1/2)^{2-3n}/(3n - 2). For many
+   steps that bound comes late. While lambda_l/lambda_1 is above 0.3 no later one is larger, because the second lobe
+   never exceeds 0.25; up to the degree where eq 5.54 falls to lambda_l the terms are thus at most those of degree
+   l. */
+
+static double metroi_cone_term(double gap, double n)
+{
+    double square = (1 - gap) * (1 - gap), product = 1;
+    if (n > 16) return gap < 0.5 ? exp(2 * n * log1p(-gap)) : gap == 1 ? 0 : exp(n * log(square));
+    for (; n > 0; n--) product *= square;
+    return product;
+}
+
+/* ln sum (2l + 1) (lambda_l/lambda_1)^{2n}, for f <= 1/2 and n >= 3. */
+static double metroi_cone_series(double f, double n)
+{
+    metroi_cone cone = metroi_cone_start(2 * f);
+    double sum = 3, l, tolerance = log(3e-13), tail, reach;
+    /* ln(C_b/lambda_1), lambda_1 = 1 - f */
+    double bound = log(1.16 * 2 * sqrt(2 / METROI_PI)) - 0.75 * log(4 * f * (1 - f));
+    for (l = 2;; l++) {
+        metroi_cone_next(&cone);
+        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n);
+        if (fmod(l, 16) > 0) continue;
+        tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.54 */
+        if (cone.gap < 0.7) {
+            reach = log1p(-cone.gap);
+            tail = 2 * n * reach + 4 / 3.0 * (bound - reach) + log(3);
+        }
+        if (tail <= tolerance + log(sum)) return log(sum);
+    }
+}
+
+/* A narrow cone makes this series long. But while the chain has not come round the sphere, the return density times
+   its area is a smooth function of the curvature that it has met: with tau = n f,
+
+       Phi(tau) = tau (1 + E_n^2)                                                     (5.55)
+
+   is analytic at tau = 0, where the sphere is a plane (for many steps it is that of the heat kernel on the sphere, 1
+   + tau/3 + tau^2/15 + ...). Below tau = h = 0.005 we therefore evaluate it at h, 2h, .. 6h, where the series has
+   some hundred terms, and extend it by the polynomial through these six values (Lagrange): what the polynomial leaves
+   is of the order of 720 h^6 times a coefficient below 0.01, which is 1e-13 at most. */
+
+#define METROI_NEAR_PLANE 0.005
+
+static double metroi_sphere_extend(const double *phi, double x)
+{
+    double sum = 0, product;
+    int i, j;
+    for (i = 1; i <= 6; i++) {
+        product = phi[i - 1];
+        for (j = 1; j <= 6; j++)
+            if (j != i) product *= (x - j) / (i - j);
+        sum += product;
+    }
+    return sum;
+}
+
+/* E^2 from Phi and ln tau, eq 5.55. */
+static metroi_scaled metroi_sphere_square(double phi, double log_tau)
+{
+    if (log_tau < -40) return metroi_scaled_make(phi, -log_tau);
+    return metroi_scaled_make(phi * exp(-log_tau) - 1, 0);
+}
+
+/* E_n^2 of a cone with share f <= 1/2 of the sphere, n >= 2. */
+static metroi_scaled metroi_cone_square(double f, double log_f, double n)
+{
+    double phi[6], tau;
+    int i;
+    if (n < 3) return metroi_sphere_square(metroi_cone_twice(f > 1e-30 ? f : 1e-30), log_f);
+    if (n * f >= METROI_NEAR_PLANE) return metroi_scaled_make(1, metroi_cone_series(f, n) + 2 * n * log1p(-f));
+    for (i = 1; i <= 6; i++) {
+        tau = METROI_NEAR_PLANE * i;
+        phi[i - 1] = tau + tau * exp(metroi_cone_series(tau / n, n) + 2 * n * log1p(-tau / n));
+    }
+    return metroi_sphere_square(metroi_sphere_extend(phi, n * f / METROI_NEAR_PLANE), log(n) + log_f);
+}
+
+/* A cone wider than a hemisphere has the spectrum of the complementary one times cot^2(alpha/2), eq 3.18, so
+
+       E_n(alpha) = cot^{2n}(alpha/2) E_n(pi - alpha) "for" alpha > pi/2              (5.56)
+
+   and from alpha = pi on a single step is uniform: the error is exactly 0. */
+
+static metroi_scaled metroi_cone_startup(double half_angle, uint64_t n)
+{
+    double s = sin(0.5 * half_angle), c = cos(0.5 * half_angle), steps = (double)n;
+    metroi_scaled square;
+    if (!(half_angle > 0 && isfinite(half_angle))) return metroi_scaled_make(METROI_NAN, 0);
+    if (n == 0) return metroi_scaled_make(METROI_INFINITY, 0);
+    if (half_angle >= METROI_PI) return metroi_scaled_make(0, 0);
+    if (n == 1) return metroi_scaled_make(1, 2 * (log(c) - log(s)));
+    if (half_angle <= 0.5 * METROI_PI) return metroi_cone_square(s * s, 2 * log(s), steps);
+    square = metroi_cone_square(c * c, 2 * log(c), steps);
+    square.log += 4 * steps * (log(c) - log(s)); /* eq 5.56 */
+    return square;
+}
+
+METRO_API double metro_cone_startup_error(double half_angle, uint64_t n)
+{
+    /* eq 5.51, without the detour over logarithms */
+    if (n == 1 && half_angle > 0 && half_angle < METROI_PI) return cos(0.5 * half_angle) / sin(0.5 * half_angle);
+    return metroi_scaled_root(metroi_cone_startup(half_angle, n));
+}
+
+METRO_API double metro_cone_startup_log_error(double half_angle, uint64_t n)
+{
+    return metroi_scaled_root_log(metroi_cone_startup(half_angle, n));
+}
+
+/* The von Mises-Fisher kernel goes the same way with tau = n/kappa in eq 5.55, since its lambda_l is about exp(-l
+   (l+1)/(2 kappa)). At tau = h the sum needs 10 + sqrt(80/h) degrees, 137, for any n; the terms are positive and
+   their logarithms concave. One step has E_1^2 = kappa lambda_1. */
+
+#define METROI_VMF_DEGREES 160
+
+static double metroi_vmf_series(double kappa, double n)
+{
+    double log_lambda[METROI_VMF_DEGREES], sum = 0;
+    size_t count = (size_t)(10 + sqrt(80 * ((kappa + 1) / n))), l;
+    metroi_vmf_logs(kappa, count, log_lambda);
+    for (l = count; l >= 1; l--) sum += (2 * (double)l + 1) * exp(2 * n * (log_lambda[l - 1] - log_lambda[0]));
+    return log(sum) + 2 * n * log_lambda[0];
+}
+
+static metroi_scaled metroi_vmf_startup(double kappa, uint64_t n)
+{
+    double phi[6], steps = (double)n, tau, first;
+    int i;
+    if (!(kappa >= 0 && isfinite(kappa))) return metroi_scaled_make(METROI_NAN, 0);
+    if (n == 0) return metroi_scaled_make(METROI_INFINITY, 0);
+    if (kappa < 1e-300) return metroi_scaled_make(0, 0);
+    if (n == 1) {
+        metroi_vmf_logs(kappa, 1, &first);
+        return metroi_scaled_make(1, log(kappa) + first);
+    }
+    if (kappa * METROI_NEAR_PLANE <= steps) return metroi_scaled_make(1, metroi_vmf_series(kappa, steps));
+    for (i = 1; i <= 6; i++) {
+        tau = METROI_NEAR_PLANE * i;
+        phi[i - 1] = tau + tau * exp(metroi_vmf_series(steps / tau, steps));
+    }
+    tau = steps / kappa;
+    return metroi_sphere_square(metroi_sphere_extend(phi, tau / METROI_NEAR_PLANE), log(steps) - log(kappa));
+}
+
+METRO_API double metro_vmf_startup_error(double kappa, uint64_t n)
+{
+    return metroi_scaled_root(metroi_vmf_startup(kappa, n));
+}
+
+METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n)
+{
+    return metroi_scaled_root_log(metroi_vmf_startup(kappa, n));
+}
+
+/* A third kernel needs no function. The phase function of Henyey and Greenstein (1941), with mean cosine g, has
+   lambda_l = g^l, so eq 5.50 is a geometric series, and
+
+       E_n^2 = frac{x (3 - x)}{(1 - x)^2}, x = g^{2n}                                 (5.57)
+
+   By eq 5.57 a chain of such steps with g = 0.9 is within 1 % of the uniform density after 50 steps. */
+
+/* # 5.18 The error of a run
+
+   The density p_n is about one sample. A picture is a mean over all of them, and what a person sees is the error of
+   that mean: its bias, which the start-up leaves, and its variance, which the correlation of neighbours feeds. For an
+   integrand given by Fourier coefficients both are sums over pairs of modes, and exact.
+
+   Seen from a seed x, the integrand is a sum of even and odd waves of the distance u = z - x that the chain has gone,
+
+       f(x + u) = sum_{i} (a_i cos(2 pi i u) + b_i sin(2 pi i u))
+       a_i = c_i cos(2 pi i x) + s_i sin(2 pi i x), b_i = s_i cos(2 pi i x) - c_i sin(2 pi i x)      (5.58)
+
+   After n steps cos(2 pi i u) has the mean P_i^n, P_i short for P*(i), and the sine has the mean 0. So the mean of
+   the M samples from n = b on is off by
+
+       beta(x) = frac{1}{M} sum_{i} a_i P_i^b S_M(P_i),
+       S_M(P) = 1 + P + ... + P^{M-1} = frac{1 - P^M}{1 - P}                          (5.59)
+
+   The bias of the estimate is the mean of beta over the seeds. Its variance is the variance of beta over the seeds
+   plus the mean over the seeds of the variance from a given seed (the law of total variance); even and odd waves do
+   not correlate, because u and -u are equally likely:
+
+       M^2 Var = sum_{i,j} (X_{ij} G_{ij} + Y_{ij} H_{ij} + Z_{ij} w_i w_j), w_i = P_i^b S_M(P_i)      (5.60)
+
+   where X, Y are the means of a_i a_j and b_i b_j over the seeds, Z is the covariance of a_i and a_j over them, and
+   G_{ij} (H_{ij}) is the covariance of sum cos(2 pi i u_n) with sum cos(2 pi j u_n) (of the sums of sines) over the
+   run. X, Y and Z do not depend on the kernel and are summed once. */
+
+typedef struct {
+    size_t harmonics;
+    int seeded;
+    double *memory;
+    double *power, *mean;         /* (c_i^2 + s_i^2)/2, and the mean of a_i over the seeds */
+    double *even, *odd, *between; /* X, Y, Z of eq 5.60, for i <= j at metroi_pair_index */
+} metroi_integrand;
+
+static size_t metroi_pair_index(size_t i, size_t j)
+{
+    return j * (j - 1) / 2 + i - 1;
+}
+
+/* Adds what one seed of weight `alpha` gives to the means; or, with `pairs`, to X, Y and Z. a and b are scratch. */
+static void metroi_integrand_add(metroi_integrand *f, const double *cosine, const double *sine, double x,
+                                 double alpha, int pairs, double *a, double *b)
+{
+    size_t i, j, at;
+    for (i = 1; i <= f->harmonics; i++) {
+        double c = metroi_cos_pi(2 * (double)i, x), s = metroi_sin_pi(2 * (double)i, x);
+        double p = cosine != NULL ? cosine[i - 1] : 0, q = sine != NULL ? sine[i - 1] : 0;
+        a[i - 1] = p * c + q * s; /* eq 5.58 */
+        b[i - 1] = q * c - p * s;
+        if (!pairs) f->mean[i - 1] += alpha * a[i - 1];
+    }
+    for (j = 1; pairs && j <= f->harmonics; j++)
+        for (i = 1; i <= j; i++) {
+            at = metroi_pair_index(i, j);
+            f->even[at] += alpha * a[i - 1] * a[j - 1];
+            f->odd[at] += alpha * b[i - 1] * b[j - 1];
+            f->between[at] += alpha * (a[i - 1] - f->mean[i - 1]) * (a[j - 1] - f->mean[j - 1]);
+        }
+}
+
+/* Takes an integrand apart. The weights are divided by their sum, so that a single seed has the weight 1 exactly. */
+static metro_result metroi_integrand_make(const double *cosine, const double *sine, size_t harmonics,
+                                          const metroi_seeds *seeds, int pairs, metroi_integrand *f)
+{
+    size_t cells = pairs ? harmonics * (harmonics + 1) / 2 : 0, i;
+    double total = 0, *a, *b;
+    /* neither a size nor the number of pairs may overflow */
+    if (harmonics > (size_t)-1 / 64 || (pairs && harmonics >> (4 * sizeof(size_t) - 3) > 0))
+        return METRO_ERROR_MEMORY;
+    for (i = 0; i < harmonics; i++)
+        if ((cosine != NULL && !isfinite(cosine[i])) || (sine != NULL && !isfinite(sine[i])))
+            return METRO_ERROR_ARGUMENT;
+    f->harmonics = harmonics;
+    f->seeded = seeds->count > 0;
+    f->memory = (double *)METRO_MALLOC((4 * harmonics + 3 * cells + 1) * sizeof(double));
+    if (f->memory == NULL) return METRO_ERROR_MEMORY;
+    memset(f->memory, 0, (4 * harmonics + 3 * cells + 1) * sizeof(double));
+    f->power = f->memory;
+    f->mean = f->power + harmonics;
+    a = f->mean + harmonics;
+    b = a + harmonics;
+    f->even = b + harmonics;
+    f->odd = f->even + cells;
+    f->between = f->odd + cells;
+    for (i = 0; i < harmonics; i++) {
+        double p = cosine != NULL ? cosine[i] : 0, q = sine != NULL ? sine[i] : 0;
+        f->power[i] = 0.5 * (p * p + q * q);
+    }
+    for (i = 0; i < seeds->count; i++) total += metroi_seed_weight(seeds, i);
+    for (i = 0; i < seeds->count; i++)
+        metroi_integrand_add(f, cosine, sine, seeds->point[i], metroi_seed_weight(seeds, i) / total, 0, a, b);
+    for (i = 0; pairs && i < seeds->count; i++)
+        metroi_integrand_add(f, cosine, sine, seeds->point[i], metroi_seed_weight(seeds, i) / total, 1, a, b);
+    return METRO_OK;
+}
+
+/* A mode of the kernel, as everything below needs it. */
+
+typedef struct {
+    double value, gap, log; /* P, 1 - P and ln abs(P) */
+} metroi_mode;
+
+static metroi_mode metroi_mode_make(const metro_kernel *k, size_t i)
+{
+    metroi_mode mode;
+    mode.value = 1;
+    mode.gap = 0;
+    if (i > 0) metroi_kernel_mode(k, (double)i, &mode.value, &mode.gap);
+    mode.log = mode.gap < 0.5 ? log1p(-mode.gap) : log(fabs(mode.value));
+    return mode;
+}
+
+/* P^m and S_m(P), m >= 1 */
+static double metroi_mode_power(metroi_mode mode, uint64_t m)
+{
+    double power = exp((double)m * mode.log);
+    return mode.value < 0 && (m & 1) ? -power : power;
+}
+
+static double metroi_mode_sum(metroi_mode mode, uint64_t m)
+{
+    double at = (double)m * mode.log;
+    if (mode.gap == 0) return (double)m;
+    if (mode.value > 0 && at > -0.7) return -expm1(at) / mode.gap;
+    return (1 - metroi_mode_power(mode, m)) / mode.gap; /* eq 5.59 */
+}
+
+/* # 5.19 Covariances by doubling
+
+   Written out, G and H are double sums of differences of powers, whose closed form divides by (1 - P)^2: at small
+   sizes and few steps it loses all digits of a variance that is itself small. We put a run together from shorter ones
+   instead. Let a run of m steps be followed by one of m'. With
+
+       eta_m = frac{1}{2} (P_{i-j}^m + P_{i+j}^m), zeta_m = frac{1}{2} (P_{i-j}^m - P_{i+j}^m)      (5.61)
+
+   which are the means of cos(2 pi i u_m) cos(2 pi j u_m) and of the product of the sines, a run of m' that starts at
+   u_m instead of 0 has the even covariance eta_m G' + zeta_m H', by the addition theorem. Let e_m be the covariance
+   of cos(2 pi i u_m) and cos(2 pi j u_m), g^{ij}_m that of the sum of cos(2 pi i u_n) over the run, n < m, with cos(2
+   pi j u_m), and o_m, h^{ij}_m the same of the sines. The law of total covariance, given u_m, then says
+
+       e_{m+m'} = eta_m e_{m'} + zeta_m o_{m'} + e_m P_i^{m'} P_j^{m'}
+       g^{ij}_{m+m'} = eta_m g^{ij}_{m'} + zeta_m h^{ij}_{m'} + P_j^{m'} (g^{ij}_m + e_m S_{m'}(P_i))
+       G_{m+m'} = G_m + eta_m G_{m'} + zeta_m H_{m'} + e_m S_{m'}(P_i) S_{m'}(P_j)
+                  + g^{ij}_m S_{m'}(P_j) + g^{ji}_m S_{m'}(P_i)                       (5.62)
+
+   and the same with even and odd exchanged for o (where the mean of a sine is 0, so o_m = zeta_m), h and H. For
+   positive falling modes every term is positive: nothing cancels, and M steps need 2 log2(M) such steps. A run of one
+   step has G = H = g = h = 0. */
+
+typedef struct {
+    metroi_mode plus, minus, i, j; /* the modes i + j, abs(i - j), i and j */
+} metroi_pair;
+
+/* A run: the covariances of its sums and of its sums with the state after it. Index 0: even, 1: odd. */
+typedef struct {
+    uint64_t steps;
+    double sum[2], forward[2], back[2]; /* G and H; g^{ij} and h^{ij}; g^{ji} and h^{ji} */
+    double state[2];                    /* e and o */
+    double plus, minus, power[2];       /* P_{i+j}^m, P_{i-j}^m, P_i^m, P_j^m for m = steps */
+    double total[2];                    /* S_m(P_i), S_m(P_j) */
+} metroi_run_block;
+
+/* The powers that belong to a run's length. Once e_m and o_m are no longer small they are taken from these: they are
+   means less products of means, and the recurrence would let their rounding errors grow with the length of the
+   run. */
+
+static void metroi_run_measure(const metroi_pair *pair, metroi_run_block *run)
+{
+    double even, odd, product;
+    run->plus = metroi_mode_power(pair->plus, run->steps);
+    run->minus = metroi_mode_power(pair->minus, run->steps);
+    run->power[0] = metroi_mode_power(pair->i, run->steps);
+    run->power[1] = metroi_mode_power(pair->j, run->steps);
+    run->total[0] = metroi_mode_sum(pair->i, run->steps);
+    run->total[1] = metroi_mode_sum(pair->j, run->steps);
+    odd = 0.5 * (run->minus - run->plus); /* eq 5.61 */
+    even = 0.5 * (run->minus + run->plus);
+    product = run->power[0] * run->power[1];
+    if (fabs(odd) >= 0.25 * fabs(run->minus)) run->state[1] = odd;
+    if (fabs(even - product) >= 0.5 * fabs(even)) run->state[0] = even - product;
+}
+
+static metroi_run_block metroi_run_join(const metroi_pair *pair, const metroi_run_block *a, const metroi_run_block *b)
+{
+    metroi_run_block ab;
+    double same = 0.5 * (a->minus + a->plus), other = a->state[1]; /* eq 5.61 */
+    int p;
+    ab.steps = a->steps + b->steps;
+    for (p = 0; p < 2; p++) {
+        int q = 1 - p;
+        /* eq 5.62 */
+        ab.sum[p] = a->sum[p] + same * b->sum[p] + other * b->sum[q] + a->state[p] * b->total[0] * b->total[1] +
+                    a->forward[p] * b->total[1] + a->back[p] * b->total[0];
+        ab.forward[p] = same * b->forward[p] + other * b->forward[q] +
+                        b->power[1] * (a->forward[p] + a->state[p] * b->total[0]);
+        ab.back[p] =
+            same * b->back[p] + other * b->back[q] + b->power[0] * (a->back[p] + a->state[p] * b->total[1]);
+        ab.state[p] = same * b->state[p] + other * b->state[q] + a->state[p] * b->power[0] * b->power[1];
+    }
+    metroi_run_measure(pair, &ab);
+    return ab;
+}
+
+/* A run of `steps` >= 1 from runs of one step, by the binary digits of `steps`. */
+static metroi_run_block metroi_run_make(const metroi_pair *pair, const metroi_run_block *one, uint64_t steps)
+{
+    metroi_run_block block = *one;
+    uint64_t bit = 1;
+    while (bit <= steps / 2) bit *= 2;
+    for (bit /= 2; bit > 0; bit /= 2) {
+        block = metroi_run_join(pair, &block, &block);
+        if (steps & bit) block = metroi_run_join(pair, one, &block);
+    }
+    return block;
+}
+
+/* All of that starts from e_1 and o_1 of a single step. o_1 is zeta_1, a difference of gaps of different sizes. But
+   e_1 is of the fourth order in the size while the gaps are of the second, so for small sizes it is integrated as it
+   stands,
+
+       e_1 = J_{ij} - (1 - P_i)(1 - P_j), J_{ij} = int 4 sin^2(pi i u) sin^2(pi j u) P(u) du      (5.63)
+
+   over a few Gauss points, all terms positive; for the Gaussian it is P_i P_j 2 sinh^2(2 pi^2 sigma^2 i j). For large
+   sizes the gaps will do: 4 sin^2(x) sin^2(y) = 2 - ... gives J = delta_i + delta_j - (delta_{i+j} + delta_{i-j})/2.
+   Cauchy steps need no more at any size, since their gaps are of the first order. */
+
+static double metroi_joint_integral(const metro_kernel *k, double i, double j)
+{
+    double low = 0, high = 0.5 * k->size, sum = 0, weight, x, y;
+    int n;
+    if (k->shape == METRO_KELEMEN) {
+        low = k->size_min;
+        high = k->size;
+    }
+    for (n = 0; n < 24; n++) {
+        double u = low + (high - low) * metroi_gauss24(n, &weight);
+        if (k->shape == METRO_TRIANGLE) weight *= 2 * (1 - u / high);
+        if (k->shape == METRO_KELEMEN) weight *= (high - low) / (u * metroi_kelemen_log(low, high));
+        x = sin(METROI_PI * i * u);
+        y = sin(METROI_PI * j * u);
+        sum += weight * 4 * x * x * y * y;
+    }
+    return sum;
+}
+
+static double metroi_joint_von_mises(double kappa, double i, double j)
+{
+    double nodes = 2 * ceil(6 * sqrt(kappa) + 24 + (i + j) / 2), sum = 1, moment = 0, n, w, s, x, y;
+    for (n = 1; 2 * n <= nodes; n++) {
+        s = sqrt(kappa) * sin(METROI_PI * (n / nodes));
+        w = (2 * n < nodes ? 2 : 1) * exp(-2 * s * s);
+        if (w < 1e-19) break;
+        x = sin(METROI_PI * (i * n / nodes));
+        y = sin(METROI_PI * (j * n / nodes));
+        sum += w;
+        moment += w * 4 * x * x * y * y;
+    }
+    return moment / sum;
+}
+
+/* J of eq 5.63 */
+static double metroi_joint_moment(const metro_kernel *k, const metroi_pair *pair, double i, double j)
+{
+    double direct = pair->i.gap + pair->j.gap - 0.5 * (pair->plus.gap + pair->minus.gap), moment = -1, a, s;
+    double reach = k->shape == METRO_KELEMEN ? k->size : 0.5 * k->size;
+    switch (k->shape) {
+    case METRO_UNIFORM:
+    case METRO_TRIANGLE:
+    case METRO_KELEMEN:
+        if (2 * METROI_PI * (i + j) * reach < 12 && !(k->shape == METRO_KELEMEN && k->size_min >= k->size))
+            moment = metroi_joint_integral(k, i, j);
+        break;
+    case METRO_GAUSSIAN:
+        a = 2 * (METROI_PI * k->size) * (METROI_PI * k->size);
+        s = sinh(a * i * j);
+        if (a * (i + j) * (i + j) < 1)
+            moment = expm1(-a * i * i) * expm1(-a * j * j) + 2 * exp(-a * (i * i + j * j)) * s * s;
+        break;
+    case METRO_VON_MISES:
+        if ((i + j) * (i + j) < 2 * k->size) moment = metroi_joint_von_mises(k->size, i, j);
+        break;
+    case METRO_CAUCHY: break;
+    }
+    /* a large step has J = 1, or 3/2 where i = j */
+    return moment < 0 ? direct : (1 - k->large) * moment + k->large * (i == j ? 1.5 : 1);
+}
+
+/* What the pair (i, j) adds to M^2 Var, eq 5.60 without its factor 2 for i < j. A burn-in is a run before, whose sums
+   do not count. */
+static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, const metroi_mode *mode, size_t i,
+                              size_t j, uint64_t burn, uint64_t steps)
+{
+    size_t at = metroi_pair_index(i, j);
+    double even, odd, same, weight;
+    metroi_run_block one, run, before;
+    metroi_pair pair;
+    if (f->even[at] == 0 && f->odd[at] == 0 && f->between[at] == 0) return 0;
+    pair.plus = mode[i + j];
+    pair.minus = mode[j - i];
+    pair.i = mode[i];
+    pair.j = mode[j];
+    memset(&one, 0, sizeof one);
+    one.steps = 1;
+    metroi_run_measure(&pair, &one);
+    one.state[0] = metroi_joint_moment(k, &pair, (double)i, (double)j) - pair.i.gap * pair.j.gap; /* eq 5.63 */
+    one.state[1] = 0.5 * (pair.plus.gap - pair.minus.gap);
+    run = metroi_run_make(&pair, &one, steps);
+    even = run.sum[0];
+    odd = run.sum[1];
+    weight = run.total[0] * run.total[1];
+    if (burn > 0) {
+        before = metroi_run_make(&pair, &one, burn);
+        same = 0.5 * (before.minus + before.plus);
+        even = same * run.sum[0] + before.state[1] * run.sum[1] + before.state[0] * weight; /* eq 5.62 */
+        odd = same * run.sum[1] + before.state[1] * run.sum[0] + before.state[1] * weight;
+        weight *= before.power[0] * before.power[1];
+    }
+    return f->even[at] * even + f->odd[at] * odd + f->between[at] * weight;
+}
+
+/* # 5.20 A chain that starts in equilibrium
+
+   From a uniform start there is no bias, and waves of different frequency do not correlate. One mode of power 1/2 has
+   the variance T_M/(2 M^2), where T_M is the sum of P^{abs(n - n')} over all pairs of steps, again put together from
+   shorter runs,
+
+       T_{m+m'} = T_m + T_{m'} + 2 P S_m(P) S_{m'}(P)                                 (5.64)
+
+   For many steps M Var tends, from any start, to
+
+       lim M Var = sum_{i} frac{c_i^2 + s_i^2}{2} frac{1 + P_i}{1 - P_i}              (5.65)
+
+   and M times the bias to the mean over the seeds of sum a_i P_i^b/(1 - P_i). The factor (1 + P)/(1 - P) is the
+   integrated autocorrelation time of the mode (chapter 7 estimates it from draws). Bias and variance are both of the
+   order 1/M: so after many steps it is the standard deviation, of the order M^{-1/2}, and not the start-up bias, that
+   a picture shows. */
+
+static double metroi_mode_stationary(metroi_mode mode, uint64_t steps)
+{
+    double total = 1;
+    uint64_t bit = 1, m = 1;
+    while (bit <= steps / 2) bit *= 2;
+    for (bit /= 2; bit > 0; bit /= 2) {
+        double sum = metroi_mode_sum(mode, m);
+        total = 2 * total + 2 * mode.value * sum * sum; /* eq 5.64 */
+        m *= 2;
+        if (!(steps & bit)) continue;
+        total += 1 + 2 * mode.value * metroi_mode_sum(mode, m);
+        m++;
+    }
+    return total;
+}
+
+/* Bias and variance, from the modes 0 .. 2 harmonics (0 .. harmonics where no pairs are needed); steps = 0: the
+   limits. */
+static metro_run_error metroi_run_evaluate(const metroi_integrand *f, const metro_kernel *k, const metroi_mode *mode,
+                                           uint64_t burn, uint64_t steps)
+{
+    metro_sum bias = { 0, 0 }, variance = { 0, 0 };
+    metro_run_error error;
+    double m = steps > 0 ? (double)steps : 1;
+    size_t i, j;
+    for (i = 1; i <= f->harmonics; i++) {
+        double weight = steps > 0 ? metroi_mode_sum(mode[i], steps) / m : 1 / mode[i].gap;
+        if (burn > 0) weight *= metroi_mode_power(mode[i], burn);
+        if (f->mean[i - 1] != 0) metro_sum_add(&bias, f->mean[i - 1] * weight); /* eq 5.59 */
+        if (f->seeded && steps > 0) continue;
+        weight = (2 - mode[i].gap) / mode[i].gap; /* eq 5.65 */
+        if (steps > 0) weight = metroi_mode_stationary(mode[i], steps) / m / m;
+        if (f->power[i - 1] != 0) metro_sum_add(&variance, f->power[i - 1] * weight);
+    }
+    for (j = 1; f->seeded && steps > 0 && j <= f->harmonics; j++)
+        for (i = 1; i <= j; i++) {
+            double square = metroi_run_pair(f, k, mode, i, j, burn, steps) / m / m; /* eq 5.60 */
+            metro_sum_add(&variance, i < j ? 2 * square : square);
+        }
+    error.bias = metro_sum_value(&bias);
+    error.variance = metro_sum_value(&variance);
+    if (error.variance < 0) error.variance = 0;
+    error.mse = steps > 0 ? error.bias * error.bias + error.variance : error.variance;
+    return error;
+}
+
+static void metroi_run_modes(const metro_kernel *k, size_t count, metroi_mode *mode)
+{
+    size_t i;
+    for (i = 0; i <= count; i++) mode[i] = metroi_mode_make(k, i);
+}
+
+/* What both functions below begin with: the arguments checked, the integrand taken apart, room for the modes. */
+static metro_result metroi_run_prepare(uint64_t steps, const double *cosine, const double *sine, size_t harmonics,
+                                       const double *seed, const double *alpha, size_t seeds, metroi_integrand *f,
+                                       metroi_mode **mode, size_t *modes)
+{
+    metroi_seeds set = metroi_seeds_make(seed, alpha, seeds);
+    int pairs = seeds > 0 && steps > 0;
+    metro_result result;
+    if (seeds > 0 && !metroi_seeds_valid(&set)) return METRO_ERROR_ARGUMENT;
+    result = metroi_integrand_make(cosine, sine, harmonics, &set, pairs, f);
+    if (result != METRO_OK) return result;
+    *modes = pairs ? 2 * harmonics : harmonics;
+    *mode = (metroi_mode *)METRO_MALLOC((*modes + 1) * sizeof(metroi_mode));
+    if (*mode != NULL) return METRO_OK;
+    METRO_FREE(f->memory);
+    return METRO_ERROR_MEMORY;
+}
+
+METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
+                                               const double *cosine, const double *sine, size_t harmonics,
+                                               const double *seed, const double *alpha, size_t seeds,
+                                               metro_run_error *error)
+{
+    metroi_integrand f;
+    metroi_mode *mode;
+    size_t modes;
+    metro_result result;
+    if (!metroi_kernel_valid(k) || error == NULL) return METRO_ERROR_ARGUMENT;
+    result = metroi_run_prepare(steps, cosine, sine, harmonics, seed, alpha, seeds, &f, &mode, &modes);
+    if (result != METRO_OK) return result;
+    metroi_run_modes(k, modes, mode);
+    *error = metroi_run_evaluate(&f, k, mode, burn, steps);
+    METRO_FREE(mode);
+    METRO_FREE(f.memory);
+    return METRO_OK;
+}
+
+/* # 5.21 The best size
+
+   Small steps correlate neighbours, and large ones land independently; so far the paper. But at constant importance
+   the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.65 is smallest where
+   P*(1) is most negative, at tan(pi Delta) = pi Delta, Delta = 1.4302966531242: neighbours then tend to lie on
+   opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples, where Delta
+   = .1 has 121 times it. Every other importance than the constant one pulls the best size down (chapter 6).
+
+   As a function of the size the mean squared error has many minima, one for each lobe of each mode. We scan it on 749
+   sizes, in sixteenths of an octave up to 1/4 and in steps of 1/80 from there to 8, and refine the three best of the
+   scan's minima by golden section (Kiefer 1953). A minimum is known to about 1e-8 of its place, as flat as it is. */
+
+typedef struct {
+    const metroi_integrand *f;
+    metroi_mode *mode;
+    size_t modes;
+    metro_kernel kernel;
+    uint64_t burn, steps;
+} metroi_size_search;
+
+static double metroi_size_error(metroi_size_search *search, double size, metro_run_error *error)
+{
+    search->kernel.size = size;
+    metroi_run_modes(&search->kernel, search->modes, search->mode);
+    *error = metroi_run_evaluate(search->f, &search->kernel, search->mode, search->burn, search->steps);
+    return error->mse;
+}
+
+#define METROI_SIZES 749
+
+static double metroi_size_scan(int i)
+{
+    return i < 128 ? ldexp(pow(2, i % 16 / 16.0), i / 16 - 10) : 0.25 + (i - 128) / 80.0;
+}
+
+/* The least value between the neighbours of scan point i. */
+static double metroi_size_refine(metroi_size_search *search, int i, double *size, metro_run_error *error)
+{
+    const double golden = 0.61803398874989485;
+    double a = metroi_size_scan(i > 0 ? i - 1 : 0), b = metroi_size_scan(i < METROI_SIZES - 1 ? i + 1 : i);
+    double x = b - golden * (b - a), y = a + golden * (b - a);
+    double at_x = metroi_size_error(search, x, error), at_y = metroi_size_error(search, y, error);
+    while (b - a > 1e-9 * b) {
+        if (at_x <= at_y) {
+            b = y;
+            y = x;
+            at_y = at_x;
+            x = b - golden * (b - a);
+            at_x = metroi_size_error(search, x, error);
+        } else {
+            a = x;
+            x = y;
+            at_x = at_y;
+            y = a + golden * (b - a);
+            at_y = metroi_size_error(search, y, error);
+        }
+    }
+    *size = 0.5 * (a + b);
+    return metroi_size_error(search, *size, error);
+}
+
+/* Indices of the three least of the minima among the scanned values; -1 where there are fewer. Plateaus count at
+   their small end, and a value must be better by more than rounding to come before a smaller size. */
+static void metroi_size_minima(const double *value, int best[3])
+{
+    int i, j, m;
+    best[0] = best[1] = best[2] = -1;
+    for (i = 0; i < METROI_SIZES; i++) {
+        if (i > 0 && value[i] >= value[i - 1] * (1 - 1e-12)) continue;
+        if (i < METROI_SIZES - 1 && value[i] > value[i + 1] * (1 + 1e-12)) continue;
+        j = 0;
+        while (j < 3 && best[j] >= 0 && value[best[j]] <= value[i] * (1 + 1e-12)) j++;
+        for (m = 2; m > j; m--) best[m] = best[m - 1];
+        if (j < 3) best[j] = i;
+    }
+}
+
+static metro_result metroi_size_find(metroi_size_search *search, double *size, metro_run_error *error)
+{
+    double *value = (double *)METRO_MALLOC(METROI_SIZES * sizeof(double)), least, found, at;
+    metro_run_error tried, best_error;
+    int best[3], i;
+    if (value == NULL) return METRO_ERROR_MEMORY;
+    for (i = 0; i < METROI_SIZES; i++) value[i] = metroi_size_error(search, metroi_size_scan(i), &tried);
+    metroi_size_minima(value, best);
+    /* the scanned place itself stands unless a refined one is better by more than rounding */
+    at = metroi_size_scan(best[0]);
+    least = metroi_size_error(search, at, &best_error);
+    for (i = 0; i < 3 && best[i] >= 0; i++) {
+        if (!(metroi_size_refine(search, best[i], &found, &tried) < least * (1 - 1e-13))) continue;
+        least = tried.mse;
+        at = found;
+        best_error = tried;
+    }
+    METRO_FREE(value);
+    *size = at;
+    *error = best_error;
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_startup_best_size(metro_shape shape, uint64_t burn, uint64_t steps, const double *cosine,
+                                               const double *sine, size_t harmonics, const double *seed,
+                                               const double *alpha, size_t seeds, double *size,
+                                               metro_run_error *error)
+{
+    metroi_integrand f;
+    metroi_size_search search;
+    metro_result result;
+    if (shape != METRO_UNIFORM && shape != METRO_TRIANGLE && shape != METRO_GAUSSIAN && shape != METRO_CAUCHY)
+        return METRO_ERROR_ARGUMENT;
+    if (size == NULL || error == NULL) return METRO_ERROR_ARGUMENT;
+    result = metroi_run_prepare(steps, cosine, sine, harmonics, seed, alpha, seeds, &f, &search.mode, &search.modes);
+    if (result != METRO_OK) return result;
+    search.f = &f;
+    search.kernel.shape = shape;
+    search.kernel.size = search.kernel.size_min = search.kernel.large = 0;
+    search.burn = burn;
+    search.steps = steps;
+    result = metroi_size_find(&search, size, error);
+    METRO_FREE(search.mode);
+    METRO_FREE(f.memory);
+    return result;
+}
+
+#undef METROI_NEAR_PLANE
+#undef METROI_VMF_DEGREES
+#undef METROI_SIZES
+
+/* # 6 The operator
+
+   Chapter 5 computes what a seed leaves behind when the importance is constant. There every tentative sample is
+   accepted, the chain is a convolution, and Fourier series turn it into products of numbers. Any other importance
+   rejects, and rejection is not a convolution: how likely the chain moves depends on where it is.
+
+   But it is still linear. One step turns the density p_n into the next one by an operator that never changes. We cut
+   the circle into cells, and the operator becomes a matrix; then what takes an ensemble of a million chains to see
+   through noise is a product of matrices, for every seed at once. This chapter makes the matrix from an importance,
+   asks it what remains of a seed after n steps, how fast that fades, and what error a run of M steps has; and then it
+   turns the question round and looks for the perturbation with the least error, which the paper calls its ultimate
+   goal.
+
+   Matrices of n cells cost n^2 numbers, so one dimension is as far as this goes. What it shows - peaks that are found
+   late, islands that are never left - is not less true in a hundred dimensions; it is only harder to see there. */
+
+/* # 6.1 From an importance to a matrix
+
+   N cells, each 1/N long, hold the importances $I_0 .. I_{N-1}$. A chain in cell i proposes cell j and accepts as
+   always. For the proposal let the point be uniform in its cell, and perturb it by the uniform kernel of full width
+   Delta: the probability that it lands m cells further on is an overlap of three boxes, two cells and a kernel. With
+   cells as the unit of length two boxes make a hat, and the kernel's box selects a part of it:
+
+       w_m = frac{1}{Delta N} int_{m - Delta N / 2}^{m + Delta N / 2} max(0, 1 - abs(t)) dt                  (6.1)
+
+   (This is the matrix that Galerkin's method with constant elements gives, so the errors of what we compute fall with
+   1/N^2. The simpler choice, the share of the kernel that lies over cell m when it starts from the middle of a cell,
+   converges as fast on average but jumps whenever an end of the kernel passes from one cell to the next.)
+
+   The difference of two integrals of the hat loses digits where both are near 1, so we integrate from the other end:
+   H(x) is what the hat has beyond x, and $w_m = (H(abs(m) - Delta N/2) - H(abs(m) + Delta N/2)) / (Delta N)$. */
+
+/* The hat's integral from x to 1. */
+static double metroi_hat_tail(double x)
+{
+    if (!(x > -1.0)) return 1.0;
+    if (!(x < 1.0)) return 0.0;
+    return x > 0 ? 0.5 * (1.0 - x) * (1.0 - x) : 1.0 - 0.5 * (1.0 + x) * (1.0 + x);
+}
+
+/* On the circle a kernel wider than the domain laps itself: $w_m$ is a sum over m + j N, with as many terms as there
+   are turns. But whole turns cover all cells evenly. So we write Delta = t + d with t whole turns and a rest d < 1,
+   add the turns as a constant, and wrap the rest once around to either side. After an odd number of turns the rest is
+   centred half a circle away: c is 0 for even t and N/2 for odd t.
+
+       w_m = frac{1}{Delta N} (t + sum_{j=-1}^{1} [H(abs(m - c + j N) - frac{d N}{2})
+           - H(abs(m - c + j N) + frac{d N}{2})])                                                              (6.2)
+
+   A Delta that is a whole number leaves no rest: every cell is as likely as any other, and proposals are
+   independent. */
+
+static double metroi_operator_weight(double size, double cells, double offset)
+{
+    double whole = floor(size), half = 0.5 * (size - whole) * cells, overlap = 0;
+    double centre = fmod(whole, 2.0) > 0 ? 0.5 * cells : 0.0;
+    int turn;
+    for (turn = -1; turn <= 1; turn++) { /* eq 6.1, wrapped as in eq 6.2 */
+        double away = fabs(offset - centre + turn * cells);
+        overlap += metroi_hat_tail(away - half) - metroi_hat_tail(away + half);
+    }
+    return (whole / size + overlap / size) / cells;
+}
+
+/* The weights of all offsets, with large steps in them. The chain proposes its own cell with what the others
+   leave. */
+static void metroi_operator_weights(const metro_kernel *kernel, size_t cells, double *weight)
+{
+    double n = (double)cells, others = 0;
+    size_t m;
+    for (m = 1; m < cells; m++) {
+        double uniform = metroi_operator_weight(kernel->size, n, (double)m);
+        weight[m] = (1.0 - kernel->large) * uniform + kernel->large / n;
+        others += weight[m];
+    }
+    weight[0] = others < 1.0 ? 1.0 - others : 0.0;
+}
+
+/* In equilibrium the chain is in cell i with probability $pi_i = I_i / (I_0 + ... + I_{N-1})$. Importances come in
+   any unit, 1e-300 or 1e300, so they are divided by the largest before they are added. Cells below 1e-300 of the
+   whole are dark: no chain enters them while there is anything else, and one that starts there is refused, as
+   metro_chain_start_point refuses it. Their rows and columns of the matrix stay 0. */
+
+static metro_result metroi_operator_stationary(const double *importance, size_t cells, double *stationary)
+{
+    metro_sum sum = { 0, 0 };
+    double largest = 0;
+    size_t i;
+    for (i = 0; i < cells; i++) {
+        if (!(importance[i] >= 0) || isinf(importance[i])) return METRO_ERROR_ARGUMENT;
+        if (importance[i] > largest) largest = importance[i];
+    }
+    if (!(largest > 0)) return METRO_ERROR_NO_IMPORTANCE;
+    for (i = 0; i < cells; i++) metro_sum_add(&sum, importance[i] / largest);
+    for (i = 0; i < cells; i++) {
+        stationary[i] = importance[i] / largest / metro_sum_value(&sum);
+        if (stationary[i] < 1e-300) stationary[i] = 0;
+    }
+    return METRO_OK;
+}
+
+/* A move is a proposal and its acceptance; what is rejected stays:
+
+       P_{ij} = w_{j-i} min(1, frac{I_j}{I_i}) "for" j != i,    P_{ii} = w_0 + r_i                           (6.3)
+
+       r_i = sum_{j != i} w_{j-i} (1 - min(1, frac{I_j}{I_i}))                                               (6.4)
+
+   $r_i$ counts rejections only. The chain also stays in its cell when it accepts a proposal from there, which is
+   $w_0$ and says more about the grid than about the chain. Since w is even and $I_i min(1, I_j/I_i) = min(I_i, I_j)$
+   does not change when i and j trade places,
+
+       pi_i P_{ij} = pi_j P_{ji}                                                                             (6.5)
+
+   This is detailed balance, and everything below leans on it. */
+
+static void metroi_operator_row(metro_operator *op, const double *importance, const double *weight, size_t i)
+{
+    double *row = op->transition + i * op->cells, rejected = 0;
+    size_t j;
+    for (j = 0; j < op->cells; j++) {
+        double w = weight[j > i ? j - i : i - j], accepted = 0;
+        if (op->stationary[j] > 0) accepted = importance[j] < importance[i] ? importance[j] / importance[i] : 1.0;
+        row[j] = w * accepted; /* eq 6.3 */
+        rejected += w * (1.0 - accepted); /* eq 6.4 */
+    }
+    row[i] += rejected;
+    op->rejection[i] = rejected;
+}
+
+/* Zeroed room for matrices and vectors in one block, or NULL. */
+static double *metroi_operator_memory(size_t cells, size_t matrices, size_t vectors)
+{
+    size_t count, i;
+    double *memory;
+    if (cells == 0 || cells > SIZE_MAX / sizeof *memory / (matrices + vectors) / cells) return NULL;
+    count = cells * (cells * matrices + vectors);
+    memory = (double *)METRO_MALLOC(count * sizeof *memory);
+    for (i = 0; memory != NULL && i < count; i++) memory[i] = 0;
+    return memory;
+}
+
+METRO_API metro_result metro_operator_make(const metro_kernel *kernel, const double *importance, size_t cells,
+                                           metro_operator *op)
+{
+    metro_operator made;
+    metro_result result;
+    double *weight, rejected = 0;
+    size_t i;
+    if (!metroi_kernel_valid(kernel) || kernel->shape != METRO_UNIFORM || cells == 0) return METRO_ERROR_ARGUMENT;
+    made.transition = metroi_operator_memory(cells, 1, 3);
+    if (made.transition == NULL) return METRO_ERROR_MEMORY;
+    made.cells = cells;
+    made.stationary = made.transition + cells * cells;
+    made.rejection = made.stationary + cells;
+    weight = made.rejection + cells;
+    result = metroi_operator_stationary(importance, cells, made.stationary);
+    if (result != METRO_OK) {
+        METRO_FREE(made.transition);
+        return result;
+    }
+    metroi_operator_weights(kernel, cells, weight);
+    for (i = 0; i < cells; i++) {
+        made.rejection[i] = METROI_NAN;
+        if (!(made.stationary[i] > 0)) continue;
+        metroi_operator_row(&made, importance, weight, i);
+        rejected += made.stationary[i] * made.rejection[i];
+    }
+    made.acceptance = 1.0 - rejected;
+    *op = made;
+    return METRO_OK;
+}
+
+static size_t metroi_operator_lit(const metro_operator *op)
+{
+    size_t i, lit = 0;
+    for (i = 0; i < op->cells; i++) lit += op->stationary[i] > 0;
+    return lit;
+}
+
+METRO_API void metro_operator_free(metro_operator *op)
+{
+    METRO_FREE(op->transition);
+    memset(op, 0, sizeof *op);
+}
+
+/* # 6.2 What the seed leaves behind
+
+   A distribution over the cells is a row of numbers, and a step multiplies it by the matrix:
+
+       p_n = p_{n-1} P = p_0 P^n                                                                             (6.6)
+
+   A seed in cell i is $p_0 = 1$ there and 0 elsewhere. It helps to look at $h_n = p_n / pi$, which says how many
+   times too often the chain is found in a cell. By eq 6.5 it evolves from the other side of the same matrix, like an
+   expectation:
+
+       h_n(i) = frac{p_n(i)}{pi_i} = sum_{j} P_{ij} h_{n-1}(j)                                               (6.7)
+
+   Rows of P sum to 1, so a step replaces each ratio by a mean of ratios around it: it smooths, until all are 1. In a
+   cell that rejects nearly everything the mean is mostly of itself, and little happens. The second form also means
+   that one function moves distributions here and expectations in section 6.5.
+
+   The smallest example has two cells with importances 1 and 3 and independent proposals, Delta = 1. From the dim cell
+   every proposal is accepted; from the bright one half of them go to the dim cell, and a third of these are accepted:
+
+                 to dim  to bright
+       dim         1/2      1/2
+       bright      1/6      5/6
+
+   In equilibrium the chain is bright 3/4 of the time. After a start in the dim cell it is dim with the probability
+   $1/4 + (3/4) 3^{-n}$, after a start in the bright one with $1/4 - (1/4) 3^{-n}$: what a seed leaves behind shrinks
+   to a third in each step, whichever seed it was, and the dim one leaves three times as much.
+
+   All of the arithmetic is in these three functions. Four terms at a time keep the adders of a processor busy. */
+
+static void metroi_matrix_add_product(const double *a, const double *b, size_t n, double *out)
+{
+    size_t i, j, k;
+    for (i = 0; i < n; i++) {
+        double *to = out + i * n;
+        for (k = 0; k + 4 <= n; k += 4) {
+            const double *factor = a + i * n + k, *b0 = b + k * n, *b1 = b0 + n, *b2 = b1 + n, *b3 = b2 + n;
+            double f0 = factor[0], f1 = factor[1], f2 = factor[2], f3 = factor[3];
+            for (j = 0; j < n; j++) to[j] += (f0 * b0[j] + f1 * b1[j]) + (f2 * b2[j] + f3 * b3[j]);
+        }
+        for (; k < n; k++)
+            for (j = 0; j < n; j++) to[j] += a[i * n + k] * b[k * n + j];
+    }
+}
+
+static double metroi_matrix_dot(const double *a, const double *b, size_t n)
+{
+    double s0 = 0, s1 = 0, s2 = 0, s3 = 0;
+    size_t i;
+    for (i = 0; i + 4 <= n; i += 4) {
+        s0 += a[i] * b[i];
+        s1 += a[i + 1] * b[i + 1];
+        s2 += a[i + 2] * b[i + 2];
+        s3 += a[i + 3] * b[i + 3];
+    }
+    for (; i < n; i++) s0 += a[i] * b[i];
+    return (s0 + s1) + (s2 + s3);
+}
+
+static void metroi_matrix_apply(const double *a, const double *x, size_t n, double *out)
+{
+    size_t i;
+    for (i = 0; i < n; i++) out[i] = metroi_matrix_dot(a + i * n, x, n);
+}
+
+/* For many steps squaring is cheaper: $P^2$, $P^4$, $P^8$ reach 2^63 steps in 63 products. Each squaring also doubles
+   what rounding has done to the sum of a row, so the sums are put right each time. No entry is negative and nothing
+   is subtracted, so even the smallest probabilities keep their digits. */
+
+static void metroi_power_double(double **power, double **spare, size_t n)
+{
+    double *square = *spare;
+    size_t i, j;
+    memset(square, 0, n * n * sizeof *square);
+    metroi_matrix_add_product(*power, *power, n, square);
+    for (i = 0; i < n; i++) {
+        double sum = 0;
+        for (j = 0; j < n; j++) sum += square[i * n + j];
+        for (j = 0; j < n && sum > 0; j++) square[i * n + j] /= sum;
+    }
+    *spare = *power;
+    *power = square;
+}
+
+/* A squaring costs as much as moving a vector n times, and halves the steps that are left. So it pays while more than
+   2 n are left. `x` holds `vectors` columns one after the other. */
+
+static metro_result metroi_operator_advance(const metro_operator *op, uint64_t steps, double *x, size_t vectors)
+{
+    size_t n = op->cells, v;
+    double *memory = metroi_operator_memory(n, 2, 1), *power = memory, *spare, *moved;
+    if (memory == NULL) return METRO_ERROR_MEMORY;
+    spare = power + n * n;
+    moved = spare + n * n;
+    memcpy(power, op->transition, n * n * sizeof *power);
+    while (steps > 0) {
+        int doubles = steps > 2 * (uint64_t)n;
+        for (v = 0; v < vectors && (!doubles || steps % 2 == 1); v++) {
+            metroi_matrix_apply(power, x + v * n, n, moved); /* eq 6.7 */
+            memcpy(x + v * n, moved, n * sizeof *moved);
+        }
+        if (doubles) metroi_power_double(&power, &spare, n);
+        steps = doubles ? steps / 2 : steps - 1;
+    }
+    METRO_FREE(memory);
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_operator_evolve(const metro_operator *op, uint64_t steps, double *mass)
+{
+    size_t n = op->cells, i;
+    double *ratio;
+    metro_result result;
+    for (i = 0; i < n; i++) {
+        if (!(mass[i] >= 0) || isinf(mass[i])) return METRO_ERROR_ARGUMENT;
+        if (mass[i] > 0 && !(op->stationary[i] > 0)) return METRO_ERROR_DARK_SEED;
+    }
+    if (steps == 0) return METRO_OK;
+    ratio = metroi_operator_memory(n, 0, 1);
+    if (ratio == NULL) return METRO_ERROR_MEMORY;
+    for (i = 0; i < n; i++) ratio[i] = mass[i] > 0 ? mass[i] / op->stationary[i] : 0;
+    result = metroi_operator_advance(op, steps, ratio, 1); /* eq 6.6 as eq 6.7 */
+    for (i = 0; i < n && result == METRO_OK; i++) mass[i] = ratio[i] * op->stationary[i];
+    METRO_FREE(ratio);
+    return result;
+}
+
+/* # 6.3 Distances, and the atom of rejections
+
+   How far is p_n from equilibrium? The norm of paper (10) is the root of the mean square of the density's error, and
+   the density of a cell is $N p_i$. Weighted by 1/pi it becomes the natural distance of a chain that obeys eq 6.5,
+   since the modes of section 6.4 are then perpendicular:
+
+       chi^2 = sum_{i} frac{(p_i - pi_i)^2}{pi_i}                                                            (6.8)
+
+       "TV" = frac{1}{2} sum_{i} abs(p_i - pi_i)                                                             (6.9)
+
+       "KL" = sum_{i} p_i ln frac{p_i}{pi_i} = sum_{i} pi_i [(1 + u_i) ln(1 + u_i) - u_i],
+       u_i = frac{p_i - pi_i}{pi_i}                                                                          (6.10)
+
+   The total variation TV is the largest error in the probability of any set whatever. The second form of the
+   divergence adds only positive terms; the first one loses everything to cancellation when p is near pi. For small u
+   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$. */
+
+static double metroi_cell_divergence(double u)
+{
+    double sum = 0, power = u, k;
+    if (fabs(u) > 0.1) return u > -1.0 ? (1.0 + u) * log1p(u) - u : 1.0;
+    for (k = 2; k <= 18; k++) {
+        power *= -u;
+        sum -= power / (k * (k - 1));
+    }
+    return sum;
+}
+
+METRO_API metro_distance metro_operator_distance(const metro_operator *op, const double *mass)
+{
+    metro_sum total = { 0, 0 }, square = { 0, 0 }, chi = { 0, 0 }, variation = { 0, 0 }, divergence = { 0, 0 };
+    metro_distance distance = { METROI_NAN, METROI_NAN, METROI_NAN, METROI_NAN };
+    size_t i;
+    for (i = 0; i < op->cells; i++) {
+        double pi = op->stationary[i], off = mass[i] - pi;
+        int dark = !(pi > 0);
+        if (!(mass[i] >= 0) || isinf(mass[i])) return distance;
+        metro_sum_add(&total, mass[i]);
+        metro_sum_add(&square, off * off);
+        metro_sum_add(&variation, fabs(off)); /* eq 6.9 */
+        if (dark && !(mass[i] > 0)) continue;
+        metro_sum_add(&chi, dark ? METROI_INFINITY : off / pi * off); /* eq 6.8 */
+        metro_sum_add(&divergence, dark ? METROI_INFINITY : pi * metroi_cell_divergence(off / pi)); /* eq 6.10 */
+    }
+    if (!(fabs(metro_sum_value(&total) - 1.0) <= 1e-9)) return distance;
+    distance.l2 = sqrt((double)op->cells * metro_sum_value(&square));
+    distance.chi = sqrt(metro_sum_value(&chi));
+    distance.total_variation = 0.5 * metro_sum_value(&variation);
+    distance.divergence = metro_sum_value(&divergence);
+    return distance;
+}
+
+/* Which of them to trust? On a grid of N cells, all look fine. But a chain whose first n proposals were all rejected
+   is still exactly at its seed, and that has the probability
+
+       r(x_0)^n                                                                                              (6.11)
+
+   however fine the grid is: beside a smooth part p_n has an atom there. The square of a delta function has no
+   integral. In our sums the atom is one cell with the mass r^n, its density is $N r^n$, and its part of the squared
+   L2 error is $N r^{2n}$: the error that we compute for that norm grows like sqrt(N), and would be infinite on the
+   true circle. Constant importance knows nothing of this, because there r is 0; it is why paper (12) is finite from n
+   = 1. TV stays finite, and counts the atom as what it is, a probability. So for an importance that rejects, quote
+   TV; L2 and chi are for comparison on one grid. */
+
+METRO_API double metro_operator_atom(const metro_operator *op, size_t cell, uint64_t steps)
+{
+    return cell < op->cells ? pow(op->rejection[cell], (double)steps) : METROI_NAN; /* eq 6.11 */
+}
+
+/* # 6.4 The spectrum
+
+   In Fourier's terms each harmonic of p_n shrinks by its own factor $P*(k)$ a step. Detailed balance gives every
+   importance such harmonics. Multiply eq 6.5 out: the matrix
+
+       S_{ij} = sqrt{pi_i} P_{ij} frac{1}{sqrt{pi_j}} = sqrt{P_{ij} P_{ji}}                                  (6.12)
+
+   is symmetric, so it has real eigenvalues $1 = lambda_1 >= lambda_2 >= ... >= -1$ and perpendicular eigenvectors
+   $v_k$, of which the first is sqrt(pi). With $phi_k = v_k / sqrt{pi}$ a seed in cell i leaves
+
+       frac{p_n(j)}{pi_j} = 1 + sum_{k=2}^{N} lambda_k^n phi_k(i) phi_k(j)                                   (6.13)
+
+   and for large n the second term is what remains: $phi_2$ has the shape of what the seed leaves behind, and
+   $phi_2(i)$ says how much of it the seed in cell i leaves. The gap $1 - lambda_2$ is the rate at which it fades. (In
+   the example of two cells $lambda_2$ is 1/3.) Two remarks on what it is worth. It never exceeds the probability that
+   the chain accepts at the mode, the peak of the importance, since a chain that cannot leave its seed cannot forget
+   it. And it is about the worst function on the circle. The picture may not contain that function at all, so a larger
+   gap need not mean a smaller error; section 6.7 asks for the error itself.
+
+   Eigenvalues of a symmetric matrix are found in two stages (Golub and Van Loan 1996, algorithms 8.3.1 and 8.3.3).
+   Reflections first make it tridiagonal: each turns a column below the diagonal onto one axis. With v of length 1 the
+   reflection is 1 - 2 v v^T, and on both sides of the matrix it amounts to A - v w^T - w v^T with w = 2 (A v - (v^T A
+   v) v). `q` collects the reflections; its rows end as eigenvectors. */
+
+static double metroi_reflector(const double *a, size_t n, size_t k, double *v)
+{
+    double length = 0, scale = 0;
+    size_t i;
+    for (i = k + 1; i < n; i++) length += a[i * n + k] * a[i * n + k];
+    length = sqrt(length);
+    for (i = k + 1; i < n; i++) v[i] = a[i * n + k];
+    v[k + 1] += copysign(length, v[k + 1]);
+    for (i = k + 1; i < n; i++) scale += v[i] * v[i];
+    for (i = k + 1; i < n; i++) v[i] = scale > 0 ? v[i] / sqrt(scale) : 0;
+    return -copysign(length, a[(k + 1) * n + k]);
+}
+
+static void metroi_tridiagonalize(double *a, double *q, size_t n, double *diagonal, double *beside, double *v,
+                                  double *w)
+{
+    size_t i, j, k;
+    for (k = 0; k + 2 < n; k++) {
+        double along = 0;
+        size_t rest = n - k - 1;
+        beside[k] = metroi_reflector(a, n, k, v);
+        /* Reflect what remains of a from both sides. */
+        for (i = k + 1; i < n; i++) w[i] = metroi_matrix_dot(a + i * n + k + 1, v + k + 1, rest);
+        along = metroi_matrix_dot(v + k + 1, w + k + 1, rest);
+        for (i = k + 1; i < n; i++) w[i] = 2.0 * (w[i] - along * v[i]);
+        for (i = k + 1; i < n; i++)
+            for (j = k + 1; j < n; j++) a[i * n + j] -= v[i] * w[j] + w[i] * v[j];
+        /* Reflect q from the left. */
+        for (j = 0; j < n; j++) w[j] = 0;
+        for (i = k + 1; i < n; i++)
+            for (j = 0; j < n; j++) w[j] += v[i] * q[i * n + j];
+        for (i = k + 1; i < n; i++)
+            for (j = 0; j < n; j++) q[i * n + j] -= 2.0 * v[i] * w[j];
+    }
+    if (n > 1) beside[n - 2] = a[n * n - 2];
+    for (i = 0; i < n; i++) diagonal[i] = a[i * n + i];
+}
+
+/* The second stage rotates the tridiagonal matrix in planes (k, k + 1) until nothing is left beside the diagonal. The
+   first rotation is aimed by Wilkinson's shift, the eigenvalue of the last 2 by 2 block that is nearer to its last
+   element; the others chase the element that it put out of place down to the end. Between `begin` and `end` no
+   element beside the diagonal is 0. */
+
+static void metroi_tridiagonal_sweep(double *d, double *e, double *q, size_t n, size_t begin, size_t end)
+{
+    double half = 0.5 * (d[end - 1] - d[end]), last = e[end - 1];
+    double x = d[begin] - d[end] + last * (last / (half + copysign(hypot(half, last), half))), z = e[begin];
+    size_t k, j;
+    for (k = begin; k < end; k++) {
+        double length = hypot(x, z), c = length > 0 ? x / length : 1.0, s = length > 0 ? z / length : 0.0;
+        double upper = d[k], lower = d[k + 1], between = e[k], *row = q + k * n, *next = row + n;
+        if (k > begin) e[k - 1] = length;
+        d[k] = c * c * upper + 2.0 * c * s * between + s * s * lower;
+        d[k + 1] = s * s * upper - 2.0 * c * s * between + c * c * lower;
+        e[k] = c * s * (lower - upper) + (c * c - s * s) * between;
+        x = e[k];
+        z = k + 1 < end ? s * e[k + 1] : 0;
+        if (k + 1 < end) e[k + 1] *= c;
+        for (j = 0; j < n; j++) {
+            double a = row[j], b = next[j];
+            row[j] = c * a + s * b;
+            next[j] = c * b - s * a;
+        }
+    }
+}
+
+/* An element beside the diagonal counts as 0 when it cannot change its neighbours. Each eigenvalue takes two or three
+   sweeps; 60 for each are never used up by numbers, but NaN would turn here for ever. Returns 0 then. */
+
+static int metroi_tridiagonal_solve(double *d, double *e, double *q, size_t n)
+{
+    size_t end = n - 1, begin, sweeps = 0;
+    while (end > 0) {
+        for (begin = end; begin > 0; begin--)
+            if (fabs(e[begin - 1]) <= 1.1e-16 * (fabs(d[begin - 1]) + fabs(d[begin]))) break;
+        if (begin == end) end--;
+        else metroi_tridiagonal_sweep(d, e, q, n, begin, end);
+        if (begin < end && sweeps++ > 60 * n) return 0;
+    }
+    return isfinite(d[0]) != 0;
+}
+
+/* The interesting eigenvalue lies next to 1, and the gap is a difference from 1: two islands with a gap of 1e-6 keep
+   ten digits of it, and with 1e-17 none. So we never form it as a difference. First, we solve for 1 - S, and move the
+   eigenvalue 0 of sqrt(pi) out of the way, to 3, beyond all others. The least eigenvalue that remains is the gap, as
+   well as its neighbours allow; its eigenvector v gives it again, as a sum of squares,
+
+       "gap" = sum_{i < j} pi_i P_{ij} (phi(i) - phi(j))^2
+           = sum_{i < j} (sqrt{P_{ij}} v_i - sqrt{P_{ji}} v_j)^2                                             (6.14)
+
+   in which nothing cancels but neighbours that really are alike, and where an error of the eigenvector enters
+   squared. This is Dirichlet's form: what a step smooths away of phi. The gap is its least value over all phi of mean
+   0 and mean square 1, so any function that one can think of bounds the gap from above: put phi = 1 on one island and
+   -1 on the other, and only the moves across count. */
+
+/* The root of P_ij, where i and j count the lit cells. */
+static double metroi_transition_root(const metro_operator *op, const size_t *lit, size_t i, size_t j)
+{
+    return sqrt(op->transition[lit[i] * op->cells + lit[j]]);
+}
+
+static double metroi_dirichlet_form(const metro_operator *op, const size_t *lit, size_t n, const double *v)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i, j;
+    for (i = 0; i < n; i++)
+        for (j = i + 1; j < n; j++) {
+            double there = metroi_transition_root(op, lit, i, j), back = metroi_transition_root(op, lit, j, i);
+            double across = there * v[i] - back * v[j];
+            metro_sum_add(&sum, across * across); /* eq 6.14 */
+        }
+    return metro_sum_value(&sum);
+}
+
+/* 1 - S over the cells that are not dark, and sqrt(pi) moved to 3. */
+static void metroi_spectrum_matrix(const metro_operator *op, const size_t *lit, size_t n, double *a, double *q)
+{
+    size_t i, j;
+    for (i = 0; i < n; i++)
+        for (j = 0; j < n; j++) {
+            double there = metroi_transition_root(op, lit, i, j), back = metroi_transition_root(op, lit, j, i);
+            q[i * n + j] = i == j ? 1.0 : 0.0;
+            a[i * n + j] = q[i * n + j] - there * back; /* eq 6.12 */
+            a[i * n + j] += 3.0 * sqrt(op->stationary[lit[i]]) * sqrt(op->stationary[lit[j]]);
+        }
+}
+
+/* Sorts 1 - d into falling order behind the 1 that belongs to the largest d, and returns the row of the least d. */
+static size_t metroi_spectrum_sort(const double *d, size_t n, double *eigenvalue)
+{
+    size_t largest = 0, least = 0, i, j, count = 1;
+    for (i = 1; i < n; i++) {
+        if (d[i] > d[largest]) largest = i;
+        if (d[i] < d[least]) least = i;
+    }
+    eigenvalue[0] = 1.0;
+    for (i = 0; i < n; i++) {
+        if (i == largest) continue;
+        for (j = count++; j > 1 && eigenvalue[j - 1] < 1.0 - d[i]; j--) eigenvalue[j] = eigenvalue[j - 1];
+        eigenvalue[j] = 1.0 - d[i];
+    }
+    return least;
+}
+
+static void metroi_spectrum_report(const metro_operator *op, const size_t *lit, size_t n, const double *sorted,
+                                   const double *v, double *eigenvalue, double *slowest, metro_spectrum *spectrum)
+{
+    size_t i;
+    spectrum->gap = n > 1 ? metroi_dirichlet_form(op, lit, n, v) : METROI_NAN;
+    spectrum->second = 1.0 - spectrum->gap;
+    spectrum->least = n > 1 ? sorted[n - 1] : METROI_NAN;
+    for (i = 0; i < op->cells; i++) {
+        if (eigenvalue != NULL) eigenvalue[i] = i >= n ? METROI_NAN : i == 1 ? spectrum->second : sorted[i];
+        if (slowest != NULL) slowest[i] = METROI_NAN;
+    }
+    for (i = 0; slowest != NULL && n > 1 && i < n; i++) /* eq 6.13 */
+        slowest[lit[i]] = v[i] / sqrt(op->stationary[lit[i]]);
+}
+
+static metro_result metroi_spectrum_compute(const metro_operator *op, const size_t *lit, size_t n, double *memory,
+                                            double *eigenvalue, double *slowest, metro_spectrum *spectrum)
+{
+    double *a = memory, *q = a + n * n, *d = q + n * n, *sorted = d + 4 * n;
+    size_t row;
+    metroi_spectrum_matrix(op, lit, n, a, q);
+    metroi_tridiagonalize(a, q, n, d, d + n, d + 2 * n, d + 3 * n);
+    if (!metroi_tridiagonal_solve(d, d + n, q, n)) return METRO_ERROR_ARGUMENT;
+    row = metroi_spectrum_sort(d, n, sorted);
+    metroi_spectrum_report(op, lit, n, sorted, q + row * n, eigenvalue, slowest, spectrum);
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_operator_spectrum(const metro_operator *op, double *eigenvalue, double *slowest,
+                                               metro_spectrum *spectrum)
+{
+    size_t n = 0, i, *lit = (size_t *)METRO_MALLOC(op->cells * sizeof *lit);
+    double *memory = metroi_operator_memory(op->cells, 2, 5);
+    metro_result result = METRO_ERROR_MEMORY;
+    if (memory != NULL && lit != NULL) {
+        for (i = 0; i < op->cells; i++)
+            if (op->stationary[i] > 0) lit[n++] = i;
+        result = metroi_spectrum_compute(op, lit, n, memory, eigenvalue, slowest, spectrum);
+    }
+    METRO_FREE(memory);
+    METRO_FREE(lit);
+    return result;
+}
+
+/* # 6.5 The error of a run, for every seed
+
+   A picture is not made of p_n but of all samples so far. Let f be the integrand in each cell and $g = f - pi(f)$ its
+   deviation from the true mean. A run of m samples from the seed has the error $(g(z_0) + ... + g(z_{m-1})) / m$. Let
+   U be the mean of this sum and V the mean of its square, both as functions of the seed. One sample more in front
+   gives
+
+       U_{m+1} = g + P U_m                                                                                   (6.15)
+
+       V_{m+1} = g^2 + 2 g P U_m + P V_m                                                                     (6.16)
+
+   from $U_0 = V_0 = 0$: the first sample adds g, then the chain moves and the rest of the run begins there. The bias
+   is U/m, the mean squared error V/m^2, and what bias^2 leaves of it is the variance: exactly, for all seeds at once,
+   with no eigenvalues and no random numbers. A burn-in of b steps means that the run begins after b moves: P^b U and
+   P^b V.
+
+   Instead of one sample, put a block of `a` samples in front. The sum over the block and the sum over what follows
+   are correlated, because the one ends where the other begins. $C_a$ carries that: applied to a function of the end
+   of the block it gives the mean of the product with the block's sum:
+
+       U_{a+m} = U_a + P^a U_m                                                                               (6.17)
+
+       V_{a+m} = V_a + 2 C_a U_m + P^a V_m,    C_a = sum_{i=0}^{a-1} P^i G P^{a-i}                           (6.18)
+
+   with g on the diagonal of G. For a = 1 this is eq 6.15 and eq 6.16. And blocks can be doubled:
+
+       C_{2a} = C_a P^a + P^a C_a                                                                            (6.19)
+
+   so that a run of 2^63 samples costs three products of matrices for each of 63 doublings. */
+
+typedef struct {
+    size_t n;
+    double *power, *cross, *spare; /* P^a, C_a and room for the next one */
+    double *sum, *square;          /* U_a and V_a of a block */
+    double *step[3];               /* what a block in front makes of the rest */
+    double *last;                  /* V before the last block */
+} metroi_run;
+
+/* The block of one sample. The mean of f is taken relative to one of its values, so that a constant f has no error at
+   all. */
+static void metroi_run_begin(metroi_run *run, const metro_operator *op, const double *f, double *memory)
+{
+    size_t n = op->cells, lit = 0, i, j;
+    metro_sum mean = { 0, 0 };
+    run->n = n;
+    run->power = memory;
+    run->cross = memory + n * n;
+    run->spare = memory + 2 * n * n;
+    run->sum = memory + 3 * n * n;
+    run->square = run->sum + n;
+    run->last = run->square + n;
+    for (i = 0; i < 3; i++) run->step[i] = run->last + (i + 1) * n;
+    while (lit + 1 < n && !(op->stationary[lit] > 0)) lit++;
+    for (i = 0; i < n; i++)
+        if (op->stationary[i] > 0) metro_sum_add(&mean, op->stationary[i] * (f[i] - f[lit]));
+    for (i = 0; i < n; i++) {
+        double g = op->stationary[i] > 0 ? f[i] - f[lit] - metro_sum_value(&mean) : 0;
+        run->sum[i] = g;
+        run->square[i] = g * g;
+        for (j = 0; j < n; j++) {
+            run->power[i * n + j] = op->transition[i * n + j];
+            run->cross[i * n + j] = g * op->transition[i * n + j];
+        }
+    }
+}
+
+/* Puts a block in front of the run whose U and V are given; `sum` may be that of the block itself. */
+static void metroi_run_prepend(metroi_run *run, double *sum, double *square)
+{
+    size_t n = run->n, i;
+    metroi_matrix_apply(run->power, sum, n, run->step[0]);
+    metroi_matrix_apply(run->cross, sum, n, run->step[1]);
+    metroi_matrix_apply(run->power, square, n, run->step[2]);
+    for (i = 0; i < n; i++) {
+        sum[i] = run->sum[i] + run->step[0][i]; /* eq 6.17, and eq 6.15 for a block of one */
+        square[i] = run->square[i] + 2.0 * run->step[1][i] + run->step[2][i]; /* eq 6.18, and eq 6.16 */
+    }
+}
+
+static void metroi_run_double(metroi_run *run)
+{
+    size_t n = run->n;
+    double *cross = run->spare;
+    metroi_run_prepend(run, run->sum, run->square);
+    memset(cross, 0, n * n * sizeof *cross);
+    metroi_matrix_add_product(run->cross, run->power, n, cross); /* eq 6.19 */
+    metroi_matrix_add_product(run->power, run->cross, n, cross);
+    run->spare = run->cross;
+    run->cross = cross;
+    metroi_power_double(&run->power, &run->spare, n);
+}
+
+/* Most chains need no 63 doublings. Once every row of $P^a$ is pi, to 13 digits, the end of a block says nothing
+   about its beginning. Then all further blocks add the same:
+
+       V_{2a+m} - V_{a+m} = V_{3a+m} - V_{2a+m}                                                              (6.20)
+
+   for every seed. Only the first block in front still sees how the run behind it ends. */
+
+static int metroi_run_settled(const metroi_run *run, const double *stationary)
+{
+    size_t i, j, n = run->n;
+    for (i = 0; i < n; i++) {
+        double distance = 0;
+        for (j = 0; j < n && stationary[i] > 0; j++) distance += fabs(run->power[i * n + j] - stationary[j]);
+        if (!(distance < 1e-13)) return 0;
+    }
+    return 1;
+}
+
+/* Section 6.7 compares many runs and wants only the best one, so a run may be given up when its error is sure to be
+   large. In equilibrium the mode of eigenvalue lambda adds to M times the mean squared error, the cost of a sample so
+   to speak, 1 plus twice the sum of $(1 - k/M) lambda^k$ over k = 1 .. M - 1. That grows with M where lambda is
+   positive, and lies between 0 and 1 where it is negative. So what a block of a <= M samples costs bounds what the
+   run will:
+
+       frac{pi(V_M)}{M} >= frac{pi(V_a)}{a} - pi(g^2)                                                        (6.21) */
+
+static double metroi_run_cost(const metroi_run *run, const double *stationary, double samples)
+{
+    return metroi_matrix_dot(stationary, run->square, run->n) / samples;
+}
+
+/* U and V of the whole run in `sum` and `square`, which arrive zeroed. Returns 0 if it was given up. */
+static int metroi_run_steps(metroi_run *run, const double *stationary, uint64_t steps, double enough, double *sum,
+                            double *square)
+{
+    int settled = metroi_run_settled(run, stationary);
+    double samples = 1.0, spread = metroi_run_cost(run, stationary, 1.0);
+    uint64_t done = 0;
+    size_t i;
+    /* A doubling costs as much as n blocks in front, and saves half of them. */
+    while (steps > 2 * (uint64_t)run->n && !settled) {
+        if (steps % 2 == 1) metroi_run_prepend(run, sum, square);
+        metroi_run_double(run);
+        steps /= 2;
+        samples *= 2.0;
+        if (metroi_run_cost(run, stationary, samples) - spread > enough) return 0; /* eq 6.21 */
+        settled = metroi_run_settled(run, stationary);
+    }
+    for (; done < steps && !(settled && done == 2); done++) {
+        memcpy(run->last, square, run->n * sizeof *square);
+        metroi_run_prepend(run, sum, square);
+    }
+    for (i = 0; i < run->n; i++) square[i] += (double)(steps - done) * (square[i] - run->last[i]); /* eq 6.20 */
+    return 1;
+}
+
+static metro_operator_error metroi_run_mean(const metro_operator *op, const double *sum, const double *square,
+                                            double steps)
+{
+    metro_operator_error mean = { 0, 0, 0 };
+    size_t lit = metroi_operator_lit(op), i;
+    for (i = 0; i < op->cells; i++) {
+        double bias = sum[i] / steps, mse = square[i] / steps / steps;
+        if (!(op->stationary[i] > 0)) continue;
+        mean.bias2 += bias * bias;
+        mean.mse += mse;
+        mean.stationary += op->stationary[i] * mse;
+    }
+    mean.bias2 /= (double)lit;
+    mean.mse /= (double)lit;
+    return mean;
+}
+
+/* Everything but the checks; a run that was given up has infinite means. */
+static metro_result metroi_run_compute(const metro_operator *op, const double *f, uint64_t burn, uint64_t steps,
+                                       double enough, double *bias, double *mse, metro_operator_error *mean)
+{
+    metroi_run run;
+    size_t n = op->cells, i;
+    double *memory = metroi_operator_memory(n, 3, 8), *sum, *square, m = (double)steps;
+    metro_result result = METRO_OK;
+    if (memory == NULL) return METRO_ERROR_MEMORY;
+    metroi_run_begin(&run, op, f, memory);
+    sum = run.step[2] + n;
+    square = sum + n;
+    if (!metroi_run_steps(&run, op->stationary, steps, enough, sum, square)) {
+        for (i = 0; i < n; i++) sum[i] = square[i] = METROI_INFINITY;
+    } else if (burn > 0) result = metroi_operator_advance(op, burn, sum, 2);
+    if (result == METRO_OK && mean != NULL) *mean = metroi_run_mean(op, sum, square, m);
+    for (i = 0; i < n && result == METRO_OK; i++) {
+        int dark = !(op->stationary[i] > 0);
+        if (bias != NULL) bias[i] = dark ? METROI_NAN : sum[i] / m;
+        if (mse != NULL) mse[i] = dark ? METROI_NAN : square[i] / m / m;
+    }
+    METRO_FREE(memory);
+    return result;
+}
+
+METRO_API metro_result metro_operator_run(const metro_operator *op, const double *f, uint64_t burn, uint64_t steps,
+                                          double *bias, double *mse, metro_operator_error *mean)
+{
+    size_t i;
+    for (i = 0; i < op->cells; i++)
+        if (!isfinite(f[i])) return METRO_ERROR_ARGUMENT;
+    if (steps == 0) return METRO_ERROR_ARGUMENT;
+    return metroi_run_compute(op, f, burn, steps, METROI_INFINITY, bias, mse, mean);
+}
+
+/* # 6.6 The exponential
+
+   The paper ends with a hint: to leave constant importance behind, "a Laplace transform method is considered on an
+   exponential integrand". Here it is. Let $I(x) = e^{-lambda x}$ on the line. The ratio of two importances depends on
+   the distance alone, so the step is the same everywhere: half of the proposals go uphill and are accepted, the other
+   half go down by t and are accepted with probability $e^{-lambda t}$. A law of steps that does not depend on the
+   place is a convolution after all, and the transform that fits a one-sided exponential is Laplace's. Each step
+   multiplies it by
+
+       phi(s) = r + frac{1}{Delta} [frac{e^{s Delta/2} - 1}{s}
+              + frac{1 - e^{-(lambda + s) Delta/2}}{lambda + s}]                                             (6.22)
+
+       r = frac{1}{2} - frac{1 - e^{-lambda Delta/2}}{lambda Delta}                                          (6.23)
+
+   where r is the probability of rejection, so that $phi(0) = 1$. From the seed x_0 the transform of p_n is $phi(s)^n
+   e^{-s x_0}$ as long as no path can have met a border, that is for the first 2 x_0 / Delta steps. All of it is made
+   of one function, $A(x) = (e^x - 1)/x$, of which the C library has the stable half: the bracket is Delta/2 times
+   $A(s Delta/2) + A(-(lambda + s) Delta/2)$, and $r = (1 - A(-lambda Delta/2))/2$. */
+
+static double metroi_exponential_mean(double x)
+{
+    if (x == 0) return 1.0;
+    return isinf(x) ? (x > 0 ? x : 0) : expm1(x) / x;
+}
+
+static int metroi_exponential_valid(double lambda, double size)
+{
+    return lambda > 0 && size > 0 && isfinite(lambda) && isfinite(size);
+}
+
+/* 1 - A(-v) = v/2 - v^2/6 + v^3/24 - ..., by the series where the difference would cancel. */
+METRO_API double metro_exponential_rejection(double lambda, double size)
+{
+    double v = 0.5 * lambda * size, term = 1.0, sum = 0, k;
+    if (!metroi_exponential_valid(lambda, size)) return METROI_NAN;
+    if (v > 0.5) return 0.5 - 0.5 * metroi_exponential_mean(-v); /* eq 6.23 */
+    for (k = 2; k <= 16; k++) {
+        term *= -v / k;
+        sum -= term;
+    }
+    return 0.5 * sum;
+}
+
+METRO_API double metro_exponential_transform(double lambda, double size, double s)
+{
+    double half = 0.5 * size;
+    if (!metroi_exponential_valid(lambda, size) || !isfinite(s)) return METROI_NAN;
+    return metro_exponential_rejection(lambda, size) /* eq 6.22 */
+         + 0.5 * (metroi_exponential_mean(s * half) + metroi_exponential_mean(-(lambda + s) * half));
+}
+
+/* Weighted by sqrt(pi), as in eq 6.12, a wave e^{i omega x} on the line has the eigenvalue $phi(-lambda/2 + i
+   omega)$. The largest of them, at omega = 0, is the edge of a continuous spectrum, and no chain on the half line x >
+   0 has a larger gap than this edge leaves. Nor can the gap exceed the probability of acceptance at the border, where
+   the importance is largest: there half of the proposals fall outside, which a rejecting border refuses and a
+   reflecting one turns inward, so
+
+       "gap" <= min(1 - phi(-frac{lambda}{2}), frac{1 - e^{-lambda Delta/2}}{lambda Delta})                  (6.24)
+
+       "gap" <= min(1 - phi(-frac{lambda}{2}), 2 frac{1 - e^{-lambda Delta/2}}{lambda Delta})                (6.25)
+
+   for a rejecting and for a reflecting border. The first bound grows with Delta and the second falls: small steps
+   diffuse slowly, large steps are rejected at the peak. They meet at lambda Delta = 4 (2 + W(-2 e^-2)) = 6.37, with
+   Lambert's W, and at 9.17: a perturbation several times as wide as the importance's own length 1/lambda. For a small
+   $v = lambda Delta/4$ the first one is v^2/6 and lower powers cancel, so there it is summed as $1/(4v)$ times the
+   sum over j >= 3 of $(-v)^j (4 - 2^j) / j!$. (These are upper bounds. The gaps of matrices like ours come down to
+   them as the line grows longer and the cells finer; that no isolated eigenvalue ever keeps the gap below them is not
+   proved.) */
+
+static double metroi_exponential_edge(double v)
+{
+    double term = 1.0, power = 1.0, sum = 0, j;
+    if (v >= 1.0) return 0.5 + 0.5 * metroi_exponential_mean(-2.0 * v) - metroi_exponential_mean(-v);
+    if (!(v > 0)) return 0;
+    for (j = 1; j <= 30; j++) {
+        term *= -v / j;
+        power *= 2.0;
+        if (j > 2) sum += term * (4.0 - power);
+    }
+    return sum / (4.0 * v);
+}
+
+METRO_API double metro_exponential_gap(double lambda, double size, int reflecting)
+{
+    double a = lambda * size, edge, border;
+    if (!metroi_exponential_valid(lambda, size)) return METROI_NAN;
+    edge = metroi_exponential_edge(0.25 * a);
+    border = (reflecting ? 1.0 : 0.5) * metroi_exponential_mean(-0.5 * a);
+    return edge < border ? edge : border; /* eq 6.24, eq 6.25 */
+}
+
+METRO_API double metro_exponential_best_size(double lambda, int reflecting)
+{
+    if (!(lambda > 0) || !isfinite(lambda)) return METROI_NAN;
+    return (reflecting ? 9.17188317468783043 : 6.37449704016016037) / lambda;
+}
+
+/* # 6.7 The best size
+
+   "The ultimate goal is to provide estimates for an optimal perturbation size", the paper says last. We can say which
+   size has the least error, if we say of what. Let a run of M steps estimate the mean of an integrand f over the
+   stationary distribution: how bright a pixel is, say. A chain records the state in which each step ends (chapter 4),
+   so this is the mean of M samples after a burn-in of one step, $V = P V_M$ in the terms of section 6.5. Its mean
+   squared error is
+
+       E_M^2(Delta) = "bias"^2 + "variance" = frac{1}{N} sum_{i} frac{V(i)}{M^2}                             (6.26)
+
+   averaged over seeds drawn uniformly, or taken at the seed that the program will use. Sections 6.1 and 6.5 compute
+   this for any size. So we look at the importance in 64 points, one drawn at random in each 64th of the circle; take
+   each for its cell; and try sizes. It costs 64 evaluations of an importance that the run itself will evaluate M
+   times, and some twenty small matrices, for any M.
+
+   Why not something simpler? The rules of thumb all look at a part of the question, and each has an importance on
+   which it fails. The largest gap chases the slowest mode whether f has any of it or not. An acceptance rate of .44,
+   which is right for a normal target on a long line, picks a size that stays on its island when there are two. The
+   largest mean jump likes big steps and overlooks a narrow peak. The error sees all of it, since it is what we want.
+   The tests hold the choice to an efficiency of at least .95: the least error of any size, computed on four times as
+   many cells, over the error of the chosen one.
+
+   A program that is about to sample asks first:
+
+       #define METRO_IMPLEMENTATION
+       #include "metro.h"
+
+       static double lamps(double x, void *user)
+       {
+           (void)user;
+           return 0.001 + exp(-800 * (x - 0.3) * (x - 0.3)) + 2 * exp(-200 * (x - 0.8) * (x - 0.8));
+       }
+
+       int main(void)
+       {
+           metro_best best;
+           metro_result result = metro_best_size(lamps, NULL, 1000, NULL, &best);
+           if (result != METRO_OK) puts(metro_result_text(result));
+           else printf("size %.2f, predicted error %.1e\n", best.size, sqrt(best.bias2 + best.variance));
+           return result != METRO_OK;
+       }
+
+   The points are drawn at random so that no feature hides between points of a grid for ever; the integrand is asked
+   only where the importance is positive, as the chain would. A value that is negative, infinite or NaN counts as
+   dark, because the chain will reject such states, and is reported. A given seed takes the place of the point in its
+   cell. */
+
+enum { METROI_PILOT_POINTS = 64 };
+
+typedef struct {
+    double importance[METROI_PILOT_POINTS], integrand[METROI_PILOT_POINTS];
+    size_t start;  /* the cell of the seed, or METROI_PILOT_POINTS for the mean over seeds */
+    size_t refused;
+    uint64_t steps;
+} metroi_pilot;
+
+/* Asks for the importance, and the integrand, at the point of one cell. */
+static metro_result metroi_pilot_point(metroi_pilot *pilot, size_t cell, double x,
+                                       double (*importance)(double x, void *user),
+                                       double (*integrand)(double x, void *user), void *user)
+{
+    double value = importance(x, user), f = cell < METROI_PILOT_POINTS / 2 ? 1.0 : 0.0;
+    if (!(value >= 0) || isinf(value)) {
+        if (cell == pilot->start) return METRO_ERROR_BAD_SEED;
+        pilot->refused++;
+        value = 0;
+    }
+    if (cell == pilot->start && !(value > 0)) return METRO_ERROR_DARK_SEED;
+    if (integrand != NULL) f = value > 0 ? integrand(x, user) : 0.0;
+    pilot->importance[cell] = value;
+    pilot->integrand[cell] = f;
+    return isfinite(f) ? METRO_OK : METRO_ERROR_ARGUMENT;
+}
+
+static metro_result metroi_pilot_survey(metroi_pilot *pilot, const metro_best_options *options,
+                                        double (*importance)(double x, void *user), void *user)
+{
+    metro_rng rng = metro_rng_make(options->seed, 0);
+    metro_result result = METRO_OK;
+    double n = METROI_PILOT_POINTS;
+    size_t cell;
+    pilot->start = METROI_PILOT_POINTS;
+    if (options->start != NULL) {
+        if (!(*options->start >= 0 && *options->start < 1)) return METRO_ERROR_ARGUMENT;
+        pilot->start = (size_t)(n * *options->start);
+    }
+    for (cell = 0; cell < METROI_PILOT_POINTS && result == METRO_OK; cell++) {
+        double x = ((double)cell + metro_rng_uniform(&rng)) / n;
+        if (cell == pilot->start) x = *options->start;
+        result = metroi_pilot_point(pilot, cell, x, importance, options->integrand, user);
+    }
+    return result;
+}
+
+/* Computes the error that one size makes, and keeps it in `best` if none was smaller. */
+static metro_result metroi_pilot_try(const metroi_pilot *pilot, double size, metro_best *best)
+{
+    double bias[METROI_PILOT_POINTS], mse[METROI_PILOT_POINTS];
+    metro_kernel kernel;
+    metro_operator op;
+    metro_operator_error mean;
+    metro_result result;
+    double enough = 4.0 * (double)pilot->steps * (best->bias2 + best->variance);
+    if (pilot->start < METROI_PILOT_POINTS) enough = METROI_INFINITY;
+    kernel.shape = METRO_UNIFORM;
+    kernel.size = size;
+    kernel.size_min = kernel.large = 0;
+    result = metro_operator_make(&kernel, pilot->importance, METROI_PILOT_POINTS, &op);
+    if (result != METRO_OK) return result;
+    result = metroi_run_compute(&op, pilot->integrand, 1, pilot->steps, enough, bias, mse, &mean);
+    if (result == METRO_OK && pilot->start < METROI_PILOT_POINTS) {
+        mean.bias2 = bias[pilot->start] * bias[pilot->start];
+        mean.mse = mse[pilot->start];
+    }
+    if (result == METRO_OK && mean.mse < best->bias2 + best->variance) { /* eq 6.26 */
+        best->size = size;
+        best->bias2 = mean.bias2;
+        best->variance = mean.mse > mean.bias2 ? mean.mse - mean.bias2 : 0;
+        best->acceptance = op.acceptance;
+        best->lit = metroi_operator_lit(&op);
+    }
+    metro_operator_free(&op);
+    return result;
+}
+
+/* As a function of the size the error may have several valleys - one for steps within a peak, one for steps from peak
+   to peak - so the search first looks everywhere. Up to half the domain the sizes grow by factors of about 1.4;
+   beyond, where islands are as far apart as a step is long, in equal steps. It ends at 2, where proposals are
+   independent as they are at 1: sizes beyond 2 only repeat what lies between, with smaller swings. Two rounds of
+   halving then close in on the best one. Sizes are tried from the largest to the smallest, so that among equals, as
+   when f is constant, the largest wins.
+
+   A size is given up (eq 6.21) when a sample costs four times what it costs with the best size so far. The bound
+   holds in equilibrium, and the seed is not drawn from it: from uniform seeds a chain that never moves can be luckier
+   than that, in 64 cells by a factor of about sqrt(64)/2 = 4. A given seed may be luckier still, and there nothing is
+   given up. */
+
+static metro_result metroi_pilot_search(const metroi_pilot *pilot, metro_best *found)
+{
+    static const double size[] = { 2.0,  1.8,  1.6,  1.4,  1.2, 1.0,   0.8,   0.64, 0.46,
+                                   0.32, 0.22, 0.15, 0.10, 0.065, 0.045, 0.03, 0.02 };
+    const size_t last = sizeof size / sizeof *size - 1;
+    metro_result result = METRO_OK;
+    double below = size[last], above = size[0];
+    size_t i;
+    int round;
+    for (i = 0; i <= last && result == METRO_OK; i++) {
+        result = metroi_pilot_try(pilot, size[i], found);
+        if (found->size == size[i]) {
+            above = size[i > 0 ? i - 1 : 0];
+            below = size[i < last ? i + 1 : last];
+        }
+    }
+    for (round = 0; round < 2 && result == METRO_OK; round++) {
+        double centre = found->size, smaller = 0.5 * (below + centre), larger = 0.5 * (centre + above);
+        result = metroi_pilot_try(pilot, smaller, found);
+        if (result == METRO_OK) result = metroi_pilot_try(pilot, larger, found);
+        below = found->size < centre ? below : found->size > centre ? centre : smaller;
+        above = found->size > centre ? above : found->size < centre ? centre : larger;
+    }
+    return result;
+}
+
+METRO_API metro_result metro_best_size(double (*importance)(double x, void *user), void *user, uint64_t steps,
+                                       const metro_best_options *options, metro_best *best)
+{
+    metro_best_options defaults = { NULL, NULL, 0 };
+    metro_best found = { 0, 0, 0, 0, 0, 0 };
+    metroi_pilot pilot;
+    metro_result result;
+    if (importance == NULL || steps == 0) return METRO_ERROR_ARGUMENT;
+    memset(&pilot, 0, sizeof pilot);
+    pilot.steps = steps;
+    found.bias2 = METROI_INFINITY;
+    result = metroi_pilot_survey(&pilot, options != NULL ? options : &defaults, importance, user);
+    if (result == METRO_OK) result = metroi_pilot_search(&pilot, &found);
+    if (result != METRO_OK) return result;
+    /* No size has a finite error: the square of the integrand is too large for a double. */
+    if (!(found.size > 0)) return METRO_ERROR_ARGUMENT;
+    /* One point says nothing about errors. */
+    if (found.lit < 2) found.bias2 = found.variance = METROI_NAN;
+    found.refused = pilot.refused;
+    *best = found;
+    return METRO_OK;
+}
+
+/* # 7 Diagnostics
+
+   A chain hands out numbers whether it has seen its whole space or only a corner of it, and they look the same. This
+   chapter asks what they are worth. It has four words for that.
+
+   - tau, the autocorrelation time: so many draws of the chain are worth one independent draw.
+   - ESS, the effective sample size: the number of draws over tau, so many independent draws would do as well.
+   - MCSE, the Monte Carlo standard error: the standard deviation of the draws over the root of ESS.
+   - R-hat: how much chains that started apart still disagree. It is 1 when one cannot tell them apart.
+
+   A fifth number is read more than all of them and belongs to none: the acceptance rate. It is the share of tentative
+   states that were taken. A chain whose steps are a thousandth of the domain takes nearly all of them and goes
+   nowhere; on a flat importance every size of step is accepted always, the worst and the best. A high rate is no
+   merit and a low one no fault, until tau or the squared jump (section 7.9) stands beside it.
+
+   And one warning covers the chapter. Every number below is made from the draws, and the draws know nothing of places
+   that no chain has been to. Four chains that started in the same one of two islands of importance agree perfectly:
+   R-hat is 1, ESS is large, and half of the integral is missing. Chains must start far apart, farther than the target
+   is wide, for their agreement to mean anything. */
+
+/* # 7.1 Numbers and their spread
+
+   Diagnostics are quotients of variances, and a variance suffers twice in floating point. In numbers like 1e8 + noise
+   the rounding of a mean is as large as what the noise has to say, so we count from the first draw on, where the
+   difference of near numbers is exact. And 1e200 has no square, so draws are divided by a power of two first, which
+   brings the largest magnitude into [1/2, 1) and, being a power of two, rounds nothing that a variance could see. */
+
+static int metroi_draws_constant(const double *value, size_t count)
+{
+    size_t i;
+    for (i = 1; i < count; i++)
+        if (value[i] != value[0]) return 0;
+    return 1;
+}
+
+static double metroi_draws_mean(const double *value, size_t count)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i;
+    for (i = 0; i < count; i++) metro_sum_add(&sum, value[i] - value[0]);
+    return value[0] + metro_sum_value(&sum) / (double)count;
+}
+
+/* The unbiased variance; 0, and exactly so, for equal numbers. */
+static double metroi_draws_variance(const double *value, size_t count)
+{
+    double mean = metroi_draws_mean(value, count);
+    metro_sum sum = { 0, 0 };
+    size_t i;
+    for (i = 0; i < count; i++) metro_sum_add(&sum, (value[i] - mean) * (value[i] - mean));
+    return count > 1 ? metro_sum_value(&sum) / (double)(count - 1) : METROI_NAN;
+}
+
+/* Whether there are draws, and all of them are finite. Infinite draws have ranks, but then they are also a defect
+   that somebody should look at. */
+static int metroi_draws_usable(const double *draw, size_t chains, size_t draws)
+{
+    size_t i;
+    if (draw == NULL || chains == 0 || draws == 0 || draws > SIZE_MAX / sizeof *draw / 2 / chains) return 0;
+    for (i = 0; i < chains * draws; i++)
+        if (!isfinite(draw[i])) return 0;
+    return 1;
+}
+
+/* The distances from the first draw, divided by 2^exponent; NULL when memory runs out. */
+static double *metroi_draws_scaled(const double *draw, size_t count, int *exponent)
+{
+    double *scaled = (double *)METRO_MALLOC(count * sizeof *scaled), largest = 0;
+    size_t i;
+    if (scaled == NULL) return NULL;
+    for (i = 0; i < count; i++) largest = fabs(draw[i]) > largest ? fabs(draw[i]) : largest;
+    frexp(largest, exponent);
+    for (i = 0; i < count; i++) scaled[i] = ldexp(draw[i], -*exponent) - ldexp(draw[0], -*exponent);
+    return scaled;
+}
+
+/* A chain that drifts disagrees with itself: its first half lies elsewhere than its second. So every chain is cut
+   into halves, and the halves are treated as chains. Of an odd number of draws the one in the middle is left out.
+   Returns 2 * chains halves of draws / 2 numbers each, or NULL when memory runs out. */
+static double *metroi_draws_halves(const double *value, size_t chains, size_t draws)
+{
+    size_t length = draws / 2, c;
+    double *half = (double *)METRO_MALLOC((2 * chains * length + 1) * sizeof *half);
+    if (half == NULL) return NULL;
+    for (c = 0; c < chains; c++) {
+        memcpy(half + 2 * c * length, value + c * draws, length * sizeof *half);
+        memcpy(half + (2 * c + 1) * length, value + c * draws + (draws - length), length * sizeof *half);
+    }
+    return half;
+}
+
+/* # 7.2 Bernstein's formula
+
+   If draws of a stationary chain have variance sigma^2 and the correlation $rho_k$ at lag k, the variance of the mean
+   of M of them counts each pair of draws: there are M - k pairs at lag k, and so
+
+       Var(frac{1}{M} sum_{i=1}^{M} f_i) = frac{sigma^2}{M} [1 + 2 sum_{k=1}^{M-1} (1 - frac{k}{M}) rho_k]   (7.1)
+
+   The paper prints the sum (18) up to M and without the factor 1 - k/M. That is close when correlations die long
+   before M, and wrong when they do not: for $rho_k = (-1)^k$ and M = 9 eq 7.1 is 1/81, one draw's worth over 81,
+   since the draws cancel in pairs and one is left; the printed form has -1/9 under its root. For large M
+
+       Var(frac{1}{M} sum_{i=1}^{M} f_i) -> frac{sigma^2 tau}{M},    tau = 1 + 2 sum_{k=1}^{inf} rho_k       (7.2)
+
+   and this tau is the autocorrelation time: M draws are worth M/tau. For $rho_k = rho^k$ it is (1 + rho)/(1 - rho).
+   It is below 1 when neighbours repel each other; and both formulas are about a stationary chain: they say nothing of
+   the start-up bias. */
+
+METRO_API double metro_bernstein(const double *rho, size_t lags, uint64_t steps)
+{
+    metro_sum sum = { 0, 0 };
+    size_t k;
+    if (rho == NULL || lags == 0 || steps == 0) return METROI_NAN;
+    metro_sum_add(&sum, rho[0]);
+    for (k = 1; k < lags && k < steps; k++) /* eq 7.1 */
+        metro_sum_add(&sum, 2 * ((double)(steps - k) / (double)steps) * rho[k]);
+    return metro_sum_value(&sum) / (double)steps;
+}
+
+/* # 7.3 Autocorrelation
+
+   From one chain of n draws with mean m the correlation at lag k is estimated by
+
+       rho_k = frac{gamma_k}{gamma_0},    gamma_k = frac{1}{n} sum_{i=1}^{n-k} (f_i - m) (f_{i+k} - m)       (7.3)
+
+   Dividing by n rather than by the number of terms bends far lags towards 0; it also keeps the noise of far lags from
+   growing, and makes gamma the transform of something positive, which is worth more (Priestley 1981, pages 323 to
+   324).
+
+   Written out the sums take n^2 steps for all lags. A discrete Fourier transform Z of the deviations, padded with as
+   many zeros so that the ends do not meet, gives them all in n log n (the theorem of Wiener and Khinchin):
+
+       n gamma_k = "Re" frac{1}{N} sum_{j=0}^{N-1} abs(Z_j)^2 e^{2 pi i j k / N},    N >= 2 n                (7.4)
+
+   The transform is that of Cooley and Tukey (1965): sort the numbers by the reversed bits of their index, then join
+   transforms of length 1 to 2, 2 to 4, and so on to N, a power of two. All cosines and sines stand in one table,
+   `wave`, with cos and sin of 2 pi k/N at 2k and 2k + 1. Each is computed, none by recurrence, so errors stay at the
+   last digit. */
+
+static void metroi_draws_fourier(double *re, double *im, const double *wave, size_t n)
+{
+    size_t i, j, bit, half, start;
+    for (i = 1, j = 0; i < n; i++) {
+        /* Count j up with its bits reversed. */
+        for (bit = n >> 1; (j & bit) != 0; bit >>= 1) j ^= bit;
+        j |= bit;
+        if (i < j) {
+            double swap_re = re[i], swap_im = im[i];
+            re[i] = re[j];
+            im[i] = im[j];
+            re[j] = swap_re;
+            im[j] = swap_im;
+        }
+    }
+    for (half = 1; half < n; half *= 2)
+        for (start = 0; start < n; start += 2 * half)
+            for (j = 0; j < half; j++) {
+                /* Join term j of two transforms to the terms j and j + half of one. */
+                double c = wave[n / half * j], s = wave[n / half * j + 1];
+                double x, y;
+                i = start + j;
+                x = re[i + half] * c + im[i + half] * s;
+                y = im[i + half] * c - re[i + half] * s;
+                re[i + half] = re[i] - x;
+                im[i + half] = im[i] - y;
+                re[i] += x;
+                im[i] += y;
+            }
+}
+
+/* The mean over several chains of gamma, each about its own mean. Sums of powers can be transformed back together,
+   and the powers of two chains come from one transform, when one rides as the real and the other as the imaginary
+   part: the real part of the autocovariance of x + iy is that of x plus that of y. The powers are real, so the way
+   back may use the same transform: conjugation changes only the imaginary part. `covariance` has room for `length`
+   numbers. Returns 0 when memory runs out. */
+static int metroi_draws_autocovariance(const double *value, size_t chains, size_t length, double *covariance)
+{
+    size_t n = 2, c, i;
+    double *work, *re, *im, *power, *wave;
+    while (n < 2 * length && n <= SIZE_MAX / 128) n *= 2;
+    if (n < 2 * length) return 0;
+    work = (double *)METRO_MALLOC(4 * n * sizeof *work);
+    if (work == NULL) return 0;
+    re = work;
+    im = work + n;
+    power = work + 2 * n;
+    wave = work + 3 * n;
+    for (i = 0; i < n; i++) power[i] = 0;
+    for (i = 0; i < n / 2; i++) {
+        wave[2 * i] = cos(2 * METROI_PI * (double)i / (double)n);
+        wave[2 * i + 1] = sin(2 * METROI_PI * (double)i / (double)n);
+    }
+    for (c = 0; c < chains; c += 2) {
+        const double *x = value + c * length, *y = c + 1 < chains ? x + length : NULL;
+        double mean_x = metroi_draws_mean(x, length), mean_y = y != NULL ? metroi_draws_mean(y, length) : 0;
+        for (i = 0; i < n; i++) {
+            re[i] = i < length ? x[i] - mean_x : 0;
+            im[i] = i < length && y != NULL ? y[i] - mean_y : 0;
+        }
+        metroi_draws_fourier(re, im, wave, n);
+        for (i = 0; i < n; i++) power[i] += re[i] * re[i] + im[i] * im[i];
+    }
+    /* Transform the powers back, eq 7.4. */
+    for (i = 0; i < n; i++) im[i] = 0;
+    metroi_draws_fourier(power, im, wave, n);
+    for (i = 0; i < length; i++) covariance[i] = power[i] / (double)n / (double)length / (double)chains;
+    METRO_FREE(work);
+    return 1;
+}
+
+METRO_API metro_result metro_autocorrelation(const double *draw, size_t draws, size_t lags, double *rho)
+{
+    int exponent, known;
+    double *scaled, *covariance;
+    size_t k;
+    if (draw == NULL || rho == NULL || lags == 0 || lags > draws) return METRO_ERROR_ARGUMENT;
+    if (!metroi_draws_usable(draw, 1, draws) || metroi_draws_constant(draw, draws)) {
+        for (k = 0; k < lags; k++) rho[k] = METROI_NAN;
+        return METRO_OK;
+    }
+    scaled = metroi_draws_scaled(draw, draws, &exponent);
+    covariance = (double *)METRO_MALLOC(draws * sizeof *covariance);
+    known = scaled != NULL && covariance != NULL && metroi_draws_autocovariance(scaled, 1, draws, covariance);
+    for (k = 0; known && k < lags; k++) rho[k] = covariance[k] / covariance[0]; /* eq 7.3 */
+    METRO_FREE(covariance);
+    METRO_FREE(scaled);
+    return known ? METRO_OK : METRO_ERROR_MEMORY;
+}
+
+/* # 7.4 The autocorrelation time
+
+   It is tempting to sum the estimated correlations over all lags. But far lags are noise, and their sum does not
+   settle however long the chain is: with eq 7.3 the sum over all lags is the same for every chain, and tau would be
+   0. One must stop. Geyer (1992, section 3.3) gives a reason where: for a reversible chain the sums of neighbours
+   $rho_{2m} + rho_{2m+1}$ are positive and fall with m. So we add pairs while they are positive (the initial positive
+   sequence) and let none be larger than the one before it (the initial monotone sequence).
+
+   Chains that have not met are no larger sample of the same thing. With m chains of n draws, W the mean of their
+   variances and V the variance of their means, Vehtari et al. (2021, section 3.2) take
+
+       rho_k = 1 - frac{W - gamma_k}{gamma_0 + V},    W = frac{n}{n - 1} gamma_0                             (7.5)
+
+   gamma being the mean over chains, each about its own mean. Chains that agree have a V of about W tau / n, and eq
+   7.5 is eq 7.3 with less noise. For chains that disagree V is large, all correlations are near 1, and tau is of the
+   order of the whole run: the chains are then worth little more than one draw each. Averaging the chains first, draw
+   by draw, and estimating tau from the average hides exactly this, since the average of chains stuck in different
+   places is a chain that moves about in one place; and it throws away the noise reduction, as the average has the
+   correlation of one chain and the noise of one.
+
+   The last pair that was looked at is not summed, but its even member, if positive, counts once: it improves tau
+   where correlations alternate (as in Stan and in posterior; where the lags ran out on a positive pair, it counts
+   whatever its sign). So, with pairs made monotone and t the lag where they end,
+
+       tau = -1 + 2 sum_{m < t/2} (rho_{2m} + rho_{2m+1}) + max(0, rho_t)                                    (7.6)
+
+   which is the 1 + 2 sum of eq 7.2, sorted by pairs. Sums that come out small are mostly luck, so tau is kept from
+   falling under 1/log10 of the number of draws. Where the lags run out before a sum has begun, as in halves of three
+   to five draws, or where even the first pair is not positive, posterior takes tau = 2, and we do as it does. */
+
+static double metroi_draws_geyer(const double *covariance, size_t n, double means_variance, double total)
+{
+    double within = covariance[0] * (double)n / (double)(n - 1), all = covariance[0] + means_variance;
+    double even = 1, odd = 1 - (within - covariance[1]) / all; /* eq 7.5 */
+    double pairs = 0, smallest = METROI_INFINITY, least = 1 / log10(total), tau;
+    size_t t = 0;
+    while (t + 5 < n && even + odd > 0) {
+        /* Add the pair, but no more than the one before it. */
+        smallest = even + odd < smallest ? even + odd : smallest;
+        pairs += smallest;
+        t += 2;
+        even = 1 - (within - covariance[t]) / all;
+        odd = 1 - (within - covariance[t + 1]) / all;
+    }
+    tau = -1 + 2 * pairs + (even > 0 || even + odd >= 0 ? even : 0); /* eq 7.6 */
+    if (t == 0) tau = 2;
+    return tau < least ? least : tau;
+}
+
+/* tau of chains that are scaled or are ranks. With `between` zero the disagreement of chains is left out of account.
+   NaN where it cannot be said. */
+static double metroi_draws_time(const double *value, size_t chains, size_t length, int between)
+{
+    double *covariance, *mean, tau = METROI_NAN;
+    size_t c;
+    if (length < 3 || metroi_draws_constant(value, chains * length)) return METROI_NAN;
+    covariance = (double *)METRO_MALLOC(length * sizeof *covariance);
+    mean = (double *)METRO_MALLOC(chains * sizeof *mean);
+    if (covariance != NULL && mean != NULL && metroi_draws_autocovariance(value, chains, length, covariance)) {
+        for (c = 0; c < chains; c++) mean[c] = metroi_draws_mean(value + c * length, length);
+        tau = metroi_draws_geyer(covariance, length, between ? metroi_draws_variance(mean, chains) : 0.0,
+                                 (double)chains * (double)length);
+    }
+    METRO_FREE(mean);
+    METRO_FREE(covariance);
+    return tau;
+}
+
+/* The same from draws in their own units. */
+static double metroi_draws_time_of(const double *draw, size_t chains, size_t draws, int between)
+{
+    int exponent;
+    double *scaled, *half = NULL, tau = METROI_NAN;
+    if (!metroi_draws_usable(draw, chains, draws)) return METROI_NAN;
+    scaled = metroi_draws_scaled(draw, chains * draws, &exponent);
+    if (scaled != NULL) half = metroi_draws_halves(scaled, chains, draws);
+    if (half != NULL) tau = metroi_draws_time(half, 2 * chains, draws / 2, between);
+    METRO_FREE(half);
+    METRO_FREE(scaled);
+    return tau;
+}
+
+METRO_API double metro_autocorrelation_time(const double *draw, size_t chains, size_t draws)
+{
+    return metroi_draws_time_of(draw, chains, draws, 1);
+}
+
+/* # 7.5 The error of a mean
+
+   With S draws in all halves, the effective sample size of their mean is
+
+       "ESS" = frac{S}{tau}                                                                                  (7.7)
+
+   and the standard error of the mean, with s the standard deviation of the draws,
+
+       "MCSE" = frac{s}{sqrt{"ESS"}}                                                                         (7.8)
+
+   The mean is the plain one over all draws, the middle ones included. */
+
+static double metroi_draws_size(double tau, size_t chains, size_t draws)
+{
+    return 2 * (double)chains * (double)(draws / 2) / tau; /* eq 7.7 */
+}
+
+METRO_API double metro_ess_mean(const double *draw, size_t chains, size_t draws)
+{
+    return metroi_draws_size(metro_autocorrelation_time(draw, chains, draws), chains, draws);
+}
+
+METRO_API double metro_mcse_mean(const double *draw, size_t chains, size_t draws)
+{
+    int exponent;
+    double ess = metro_ess_mean(draw, chains, draws), variance, *scaled;
+    if (isnan(ess)) return METROI_NAN;
+    scaled = metroi_draws_scaled(draw, chains * draws, &exponent);
+    if (scaled == NULL) return METROI_NAN;
+    variance = metroi_draws_variance(scaled, chains * draws);
+    METRO_FREE(scaled);
+    return ldexp(sqrt(variance / ess), exponent); /* eq 7.8 */
+}
+
+/* The standard deviation is the root of the mean of g = (f - mean)^2, so its error follows from that of a mean: the
+   root of a number with a small error d has the error d over twice the root,
+
+       "MCSE"(s) = frac{1}{2} sqrt{frac{E[g^2] - E[g]^2}{E[g] "ESS"_g}}                                      (7.9)
+
+   If all draws are equally far from the mean, the g differ by rounding alone and carry no information: the squares of
+   numbers up to d that are off by a unit e of rounding are off by 2 d e. */
+
+METRO_API double metro_mcse_sd(const double *draw, size_t chains, size_t draws)
+{
+    int exponent;
+    const double epsilon = 2.2204460492503131e-16; /* 2^-52 */
+    size_t count, i;
+    double *g, mean, ess, g1, g2, least = METROI_INFINITY, largest = 0;
+    if (!metroi_draws_usable(draw, chains, draws)) return METROI_NAN;
+    count = chains * draws;
+    g = metroi_draws_scaled(draw, count, &exponent);
+    if (g == NULL) return METROI_NAN;
+    mean = metroi_draws_mean(g, count);
+    for (i = 0; i < count; i++) {
+        g[i] = (g[i] - mean) * (g[i] - mean);
+        if (g[i] < least) least = g[i];
+        if (g[i] > largest) largest = g[i];
+    }
+    ess = metro_ess_mean(g, chains, draws);
+    g1 = metroi_draws_mean(g, count);
+    for (i = 0; i < count; i++) g[i] = (g[i] - g1) * (g[i] - g1);
+    g2 = metroi_draws_mean(g, count);
+    METRO_FREE(g);
+    if (!(largest - least > 4 * epsilon * sqrt(largest))) return METROI_NAN;
+    return ldexp(0.5 * sqrt(g2 / (g1 * ess)), exponent); /* eq 7.9 */
+}
+
+/* # 7.6 Ranks
+
+   Means and variances need not exist: f/I may have tails so long that one draw in a million outweighs the rest. Ranks
+   always exist. Vehtari et al. (2021, section 4) replace each draw by the normal number that belongs to its rank r
+   among all S draws (Blom 1958),
+
+       z = Phi^{-1}(frac{r - 3/8}{S + 1/4})                                                                  (7.10)
+
+   with the mean rank for draws that are equal; Phi is the normal distribution function. What z says of the chains is
+   the same for f and for any rising function of f.
+
+   The inverse of Phi is algorithm AS 241 (PPND16) of Wichura (1988), good to 1e-16: rational functions of p about the
+   middle and of the root of -ln p outside. His third piece, for p below 1.4e-11, belongs to more than 4e10 draws and
+   is left out. */
+
+static double metroi_normal_quotient(const double *above, const double *below, double x)
+{
+    double a = above[7], b = below[7];
+    int i;
+    for (i = 6; i >= 0; i--) {
+        a = a * x + above[i];
+        b = b * x + below[i];
+    }
+    return a / b;
+}
+
+/* Phi^{-1}(p), 1.4e-11 < p < 1 - 1.4e-11. */
+static double metroi_normal_inverse(double p)
+{
+    static const double middle[2][8] = {
+        { 3.3871328727963666080e0, 1.3314166789178437745e2, 1.9715909503065514427e3, 1.3731693765509461125e4,
+          4.5921953931549871457e4, 6.7265770927008700853e4, 3.3430575583588128105e4, 2.5090809287301226727e3 },
+        { 1.0, 4.2313330701600911252e1, 6.8718700749205790830e2, 5.3941960214247511077e3,
+          2.1213794301586595867e4, 3.9307895800092710610e4, 2.8729085735721942674e4, 5.2264952788528545610e3 }
+    };
+    static const double outside[2][8] = {
+        { 1.42343711074968357734e0, 4.63033784615654529590e0, 5.76949722146069140550e0, 3.64784832476320460504e0,
+          1.27045825245236838258e0, 2.41780725177450611770e-1, 2.27238449892691845833e-2, 7.74545014278341407640e-4 },
+        { 1.0, 2.05319162663775882187e0, 1.67638483018380384940e0, 6.89767334985100004550e-1,
+          1.48103976427480074590e-1, 1.51986665636164571966e-2, 5.47593808499534494600e-4, 1.05075007164441684324e-9 }
+    };
+    double q = p - 0.5, z;
+    if (fabs(q) <= 0.425) return q * metroi_normal_quotient(middle[0], middle[1], 0.180625 - q * q);
+    z = metroi_normal_quotient(outside[0], outside[1], sqrt(-log(q < 0 ? p : 1 - p)) - 1.6);
+    return q < 0 ? -z : z;
+}
+
+typedef struct {
+    double value;
+    size_t index;
+} metroi_draws_place;
+
+/* Orders doubles, and places by their value, which stands first in them. */
+static int metroi_draws_compare(const void *a, const void *b)
+{
+    double x = *(const double *)a, y = *(const double *)b;
+    return (x > y) - (x < y);
+}
+
+/* Replaces the values by their z. Returns 0 when memory runs out. */
+static int metroi_draws_rank(double *value, size_t count)
+{
+    metroi_draws_place *place;
+    size_t i, first, next;
+    if (count > SIZE_MAX / sizeof *place) return 0;
+    place = (metroi_draws_place *)METRO_MALLOC(count * sizeof *place + 1);
+    if (place == NULL) return 0;
+    for (i = 0; i < count; i++) {
+        place[i].value = value[i];
+        place[i].index = i;
+    }
+    qsort(place, count, sizeof *place, metroi_draws_compare);
+    /* Ranks count from 1: equal draws at the places first .. next - 1 have the mean rank (first + 1 + next) / 2. */
+    for (first = 0; first < count; first = next) {
+        double rank, z;
+        next = first + 1;
+        while (next < count && !(place[next].value > place[first].value)) next++;
+        rank = 0.5 * ((double)first + 1 + (double)next);
+        z = metroi_normal_inverse((rank - 0.375) / ((double)count + 0.25)); /* eq 7.10 */
+        for (i = first; i < next; i++) value[place[i].index] = z;
+    }
+    METRO_FREE(place);
+    return 1;
+}
+
+/* # 7.7 R-hat
+
+   If m chains of n draws sample the same distribution, two estimates of its variance agree: W, the mean of the
+   variances within the chains, and one that adds V, the variance of their means. While they are still where they
+   started, the second is the larger. The root of the quotient is the R-hat of Gelman and Rubin (1992), in the form of
+   Vehtari et al. (2021):
+
+       "R-hat" = sqrt{frac{n - 1}{n} + frac{V}{W}}                                                           (7.11)
+
+   The chains are halves (section 7.1) and the draws are ranks (section 7.6). Chains may also agree in their place and
+   differ in their width: then their distances from the median differ in place. R-hat is the larger of the two values.
+
+   How much is too much? Vehtari et al. ask for R-hat below 1.01 before a result is used. Halves of n draws that agree
+   have a V of about W tau/n, so the square of R-hat is about 1 + tau/n: 1.01 also asks for chains of some 100 tau.
+
+   Chains that all stand still have W = 0. If they stand at the same place there is nothing to say; if not, R-hat is
+   infinite. In posterior the rounding of a mean leaves something like 1e15 there, and NA for two chains, whose
+   distances from their median are equal. */
+
+static double metroi_draws_disagreement(const double *value, size_t chains, size_t length)
+{
+    double *variance, *mean, within, between;
+    size_t c;
+    if (length < 2 || metroi_draws_constant(value, chains * length)) return METROI_NAN;
+    variance = (double *)METRO_MALLOC(2 * chains * sizeof *variance);
+    if (variance == NULL) return METROI_NAN;
+    mean = variance + chains;
+    for (c = 0; c < chains; c++) {
+        variance[c] = metroi_draws_variance(value + c * length, length);
+        mean[c] = metroi_draws_mean(value + c * length, length);
+    }
+    within = metroi_draws_mean(variance, chains);
+    between = metroi_draws_variance(mean, chains);
+    METRO_FREE(variance);
+    if (!(within > 0)) return METROI_INFINITY;
+    return sqrt((double)(length - 1) / (double)length + between / within); /* eq 7.11 */
+}
+
+/* R-hat of the ranks of the halves. */
+static double metroi_draws_ranked_rhat(const double *value, size_t chains, size_t draws)
+{
+    double *half = metroi_draws_halves(value, chains, draws), rhat = METROI_NAN;
+    if (half != NULL && metroi_draws_rank(half, 2 * chains * (draws / 2)))
+        rhat = metroi_draws_disagreement(half, 2 * chains, draws / 2);
+    METRO_FREE(half);
+    return rhat;
+}
+
+/* A sorted copy, or NULL when memory runs out. */
+static double *metroi_draws_sorted(const double *draw, size_t count)
+{
+    double *sorted = (double *)METRO_MALLOC(count * sizeof *sorted);
+    if (sorted == NULL) return NULL;
+    memcpy(sorted, draw, count * sizeof *sorted);
+    qsort(sorted, count, sizeof *sorted, metroi_draws_compare);
+    return sorted;
+}
+
+METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws)
+{
+    double place, width, median, *folded;
+    size_t count, i;
+    if (!metroi_draws_usable(draw, chains, draws)) return METROI_NAN;
+    count = chains * draws;
+    place = metroi_draws_ranked_rhat(draw, chains, draws);
+    /* What stands still in different places needs no second opinion, and what has no answer gets none. */
+    if (!(place < METROI_INFINITY)) return place;
+    folded = metroi_draws_sorted(draw, count);
+    if (folded == NULL) return METROI_NAN;
+    median = 0.5 * folded[(count - 1) / 2] + 0.5 * folded[count / 2];
+    for (i = 0; i < count; i++) folded[i] = fabs(draw[i] - median);
+    width = metroi_draws_ranked_rhat(folded, chains, draws);
+    METRO_FREE(folded);
+    return isnan(width) || width > place ? width : place;
+}
+
+/* # 7.8 Bulk and tail
+
+   The effective sample size of the ranks judges the bulk of the distribution. The tails can be far worse: a chain may
+   visit a narrow bright peak so rarely that its mean looks settled. So we also count how often draws lie below their
+   quantile at .05 and below that at .95; each count is a mean of zeros and ones and has an effective sample size of
+   its own, and the smaller one is the tail's.
+
+   The quantile q of S draws lies between two of them, at the fraction q (S - 1) of their order. No draw lies between
+   the quantile and the draw below it, so comparing with that draw gives the same zeros and ones, and interpolation,
+   with its rounding, is not needed. At .95 its place is S - 1 less a twentieth of that, rounded up. */
+
+METRO_API double metro_ess(const double *draw, size_t chains, size_t draws)
+{
+    double *half, tau = METROI_NAN;
+    if (!metroi_draws_usable(draw, chains, draws)) return METROI_NAN;
+    half = metroi_draws_halves(draw, chains, draws);
+    if (half != NULL && metroi_draws_rank(half, 2 * chains * (draws / 2)))
+        tau = metroi_draws_time(half, 2 * chains, draws / 2, 1);
+    METRO_FREE(half);
+    return metroi_draws_size(tau, chains, draws);
+}
+
+/* The effective sample size of the share of draws up to `bound`. */
+static double metroi_draws_share_size(const double *draw, size_t chains, size_t draws, double bound)
+{
+    double *below = (double *)METRO_MALLOC(chains * draws * sizeof *below), ess;
+    size_t i;
+    if (below == NULL) return METROI_NAN;
+    for (i = 0; i < chains * draws; i++) below[i] = draw[i] <= bound ? 1 : 0;
+    ess = metro_ess_mean(below, chains, draws);
+    METRO_FREE(below);
+    return ess;
+}
+
+METRO_API double metro_ess_tail(const double *draw, size_t chains, size_t draws)
+{
+    double *sorted, low, high;
+    size_t last;
+    if (!metroi_draws_usable(draw, chains, draws)) return METROI_NAN;
+    sorted = metroi_draws_sorted(draw, chains * draws);
+    if (sorted == NULL) return METROI_NAN;
+    last = chains * draws - 1;
+    low = metroi_draws_share_size(draw, chains, draws, sorted[last / 20]);
+    high = metroi_draws_share_size(draw, chains, draws, sorted[last - (last / 20 + (last % 20 != 0))]);
+    METRO_FREE(sorted);
+    return isnan(low) || low < high ? low : high;
+}
+
+/* # 7.9 The squared jump
+
+   The mean squared distance between consecutive draws (Pasarica and Gelman 2010) needs no window and no sum over
+   lags. For a stationary chain on the line it is the first correlation in another dress,
+
+       E[(z_{i+1} - z_i)^2] = 2 sigma^2 (1 - rho_1)                                                          (7.12)
+
+   so the longer the jumps, the smaller rho_1, stays counting as jumps of length 0. It looks one step ahead only: a
+   chain that jumps well inside each of two peaks and never between them has long jumps and an endless tau. On a
+   circle the shorter way counts. */
+
+METRO_API double metro_squared_jump(const double *draw, size_t draws, double period)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i;
+    if (!(period >= 0) || isinf(period) || draws < 2 || !metroi_draws_usable(draw, 1, draws)) return METROI_NAN;
+    for (i = 1; i < draws; i++) {
+        double jump = draw[i] - draw[i - 1];
+        if (period > 0) jump = remainder(jump, period);
+        metro_sum_add(&sum, jump * jump); /* eq 7.12 */
+    }
+    return metro_sum_value(&sum) / (double)(draws - 1);
+}
+
+/* # 7.10 Bias and variance apart
+
+   The mean squared error of a run is its squared bias plus its variance. One run shows their sum; to see them apart
+   one repeats the run with other random numbers. Let $x_r$ be what run r of R gives for a value that is t in truth, m
+   the mean of the R and s^2 their unbiased variance. Then (m - t)^2 is too large by the variance of m, and
+
+       b^2 = (m - t)^2 - frac{s^2}{R},    "MSE" = b^2 + s^2 = frac{1}{R} sum_{r=1}^{R} (x_r - t)^2           (7.13)
+
+   is unbiased. It may be negative, and must be allowed to: whoever clips it at zero adds a bias to the measurement of
+   bias. For a picture each is averaged over its values.
+
+   How far off are they? The values of one run depend on each other, the runs do not, so the unit is the run. The
+   jackknife leaves out one run at a time and looks at how the answer theta moves (Efron and Stein 1981):
+
+       "error"^2 = frac{R - 1}{R} sum_{r=1}^{R} (theta_r - frac{1}{R} sum_{q=1}^{R} theta_q)^2               (7.14)
+
+   Without run r, whose deviation is $e_r = x_r - m$, the mean is $m - e_r/(R - 1)$ and the sum of squared deviations
+   is smaller by $e_r^2 R/(R - 1)$; nothing has to be summed again. For the mean squared error eq 7.14 is the usual
+   error of a mean.
+
+   The jackknife errs upwards, and for b^2 where there is no bias, and b^2 is all products of two runs, it is too
+   large by the factor sqrt(2 (R - 1)/(R - 2)). */
+
+/* Adds what one value says of bias^2, variance and mean squared error to `total`, and of each without one of the runs
+   to `left_out`. `value` is the value in the first run, and `stride` numbers on it stands in the next. What too few
+   runs cannot say becomes NaN. */
+static void metroi_repeats_add(const double *value, size_t stride, size_t repeats, double truth, metro_sum total[3],
+                               double *left_out[3])
+{
+    double runs = (double)repeats, others = repeats > 1 ? runs - 1 : METROI_NAN;
+    double less = repeats > 2 ? runs - 2 : METROI_NAN, mean, bias, squares = 0, error2 = 0;
+    metro_sum sum = { 0, 0 };
+    size_t r;
+    for (r = 0; r < repeats; r++) metro_sum_add(&sum, value[r * stride] - value[0]);
+    mean = value[0] + metro_sum_value(&sum) / runs;
+    bias = mean - truth;
+    for (r = 0; r < repeats; r++) {
+        squares += (value[r * stride] - mean) * (value[r * stride] - mean);
+        error2 += (value[r * stride] - truth) * (value[r * stride] - truth);
+    }
+    metro_sum_add(&total[0], bias * bias - squares / others / runs); /* eq 7.13 */
+    metro_sum_add(&total[1], squares / others);
+    metro_sum_add(&total[2], error2 / runs);
+    /* Leave out one run after the other. */
+    for (r = 0; r < repeats; r++) {
+        double e = value[r * stride] - mean, d = value[r * stride] - truth;
+        double shifted = bias - e / others, variance = (squares - e * e * runs / others) / less;
+        left_out[0][r] += shifted * shifted - variance / others;
+        left_out[1][r] += variance;
+        left_out[2][r] += (error2 - d * d) / others;
+    }
+}
+
+/* The jackknife error of a mean over `values` values, eq 7.14. */
+static double metroi_repeats_error(const double *left_out, size_t repeats, size_t values)
+{
+    double spread = metroi_draws_variance(left_out, repeats), runs = (double)repeats;
+    return (runs - 1) * sqrt(spread / runs) / (double)values;
+}
+
+METRO_API metro_result metro_repeats(const double *estimate, const double *truth, size_t repeats, size_t values,
+                                     metro_bias_variance *out)
+{
+    metro_sum total[3] = { { 0, 0 }, { 0, 0 }, { 0, 0 } };
+    double *left_out[3];
+    size_t v, i;
+    if (estimate == NULL || truth == NULL || out == NULL || repeats == 0 || values == 0) return METRO_ERROR_ARGUMENT;
+    if (repeats > SIZE_MAX / 3 / sizeof(double)) return METRO_ERROR_MEMORY;
+    left_out[0] = (double *)METRO_MALLOC(3 * repeats * sizeof(double));
+    if (left_out[0] == NULL) return METRO_ERROR_MEMORY;
+    left_out[1] = left_out[0] + repeats;
+    left_out[2] = left_out[1] + repeats;
+    for (i = 0; i < 3 * repeats; i++) left_out[0][i] = 0;
+    for (v = 0; v < values; v++) metroi_repeats_add(estimate + v, values, repeats, truth[v], total, left_out);
+    out->bias2 = metro_sum_value(&total[0]) / (double)values;
+    out->variance = metro_sum_value(&total[1]) / (double)values;
+    out->mse = metro_sum_value(&total[2]) / (double)values;
+    out->bias2_error = metroi_repeats_error(left_out[0], repeats, values);
+    out->variance_error = metroi_repeats_error(left_out[1], repeats, values);
+    out->mse_error = metroi_repeats_error(left_out[2], repeats, values);
+    METRO_FREE(left_out[0]);
+    return METRO_OK;
+}
+
+/* # 7.11 What cannot be said
+
+   A diagnostic that fails should say so and say why. The reasons are looked for from the plainest on. The last two
+   are judgements, and their bounds have reasons. tau is estimated from the draws themselves, and a chain that is not
+   much longer than tau cannot know its tau: it takes its slow wandering for its mean, and finds the rest well mixed.
+   Fifty tau is the customary length from which the estimate holds (it is the rule of emcee, Foreman-Mackey et al.
+   2013). It is asked within the chains, so that chains stuck apart are not called short. Chains of 50 tau that agree
+   have an R-hat of about 1.02 by chance; 1.1 is seldom chance. */
+
+METRO_API const char *metro_draws_trouble(const double *draw, size_t chains, size_t draws)
+{
+    size_t c, still = 0;
+    double rhat, tau;
+    if (draw == NULL || chains == 0 || draws == 0) return "there are no draws";
+    if (!metroi_draws_usable(draw, chains, draws)) return "a draw is not finite";
+    if (draws < 4) return "there are fewer than four draws a chain, so its halves have no variance";
+    if (metroi_draws_constant(draw, chains * draws)) return "all draws are equal";
+    for (c = 0; c < chains; c++) still += metroi_draws_constant(draw + c * draws, draws) ? 1 : 0;
+    if (still == chains) return "every chain stands still, and not all at the same place";
+    if (still > 0) return "a chain stands still";
+    if (draws < 6) return "there are fewer than six draws a chain, so its halves have no autocorrelation";
+    rhat = metro_rhat(draw, chains, draws);
+    if (isnan(rhat))
+        return "R-hat cannot be said: all draws (but perhaps a middle one) are as far from the median, or no memory";
+    tau = metroi_draws_time_of(draw, chains, draws, 0);
+    if (isnan(tau)) return "memory ran out";
+    if (!((double)draws >= 50 * tau))
+        return "the chains are shorter than 50 autocorrelation times: the estimates are unreliable";
+    if (rhat > 1.1) return "the chains or their halves disagree: R-hat is above 1.1";
+    return NULL;
+}
+
+/* # 7.12 Detailed balance
+
+   A mutation with an asymmetry that its ratio T(t -> i)/T(i -> t) leaves out gives pictures that look plausible and
+   are wrong. The check asks for no theory of the mutation, only for its code. Let x be distributed as the target and
+   let y be the state after x. Detailed balance (eq 4.3) says that the pairs (x, y) and (y, x) are equally likely, so
+   for any two cells A and B of a coordinate
+
+       P(x "in" A, y "in" B) = P(x "in" B, y "in" A)                                                          (7.15)
+
+   No sampler is needed to test the sampler: x is a uniform draw, kept with probability I(x)/max I. Each pair that is
+   kept and connects A and B goes the one way or the other by a fair coin, so with $n_{AB}$ pairs from A to B
+
+       chi^2 = sum_{A < B} frac{(n_{AB} - n_{BA})^2}{n_{AB} + n_{BA}}                                         (7.16)
+
+   has mean 1 a term (Bowker 1948). Terms of less than 20 pairs are left out. A step clamped to the border, a rejected
+   step repeated until it is accepted, a ratio upside down: all move more one way than the other.
+
+   In several dimensions we test one coordinate at a time. The coordinates of a uniform direction are uniform in [-1,
+   1] each, which is Archimedes' theorem, so they have cells of equal measure too. */
+
+static size_t metroi_coordinate_cell(double value, int of_direction, size_t cells)
+{
+    double place = (of_direction ? (value + 1) / 2 : value) * (double)cells;
+    if (!(place > 0)) return 0;
+    return place < (double)cells ? (size_t)place : cells - 1;
+}
+
+/* Counts one pair: flow[coordinate][A][B]. */
+static void metroi_flow_add(const metro_target *target, const double *x, const double *y, size_t cells, double *flow)
+{
+    size_t coordinate = 0, axis, i;
+    for (axis = 0; axis < target->axis_count; axis++) {
+        size_t doubles = metroi_axis_doubles(target->axes[axis].kind);
+        for (i = 0; i < doubles; i++, coordinate++) {
+            size_t from = metroi_coordinate_cell(x[coordinate], doubles == 3, cells);
+            size_t to = metroi_coordinate_cell(y[coordinate], doubles == 3, cells);
+            flow[(coordinate * cells + from) * cells + to] += 1;
+        }
+    }
+}
+
+/* The largest importance of the next `draws` uniform states of a stream; what is no proper importance counts as 0. */
+static double metroi_largest_importance(metro_chain *chain, uint64_t draws, double *x, metro_rng rng)
+{
+    const metro_target *target = &chain->target;
+    double largest = 0;
+    uint64_t i;
+    for (i = 0; i < draws; i++) {
+        double importance;
+        metroi_state_draw(target, x, &rng);
+        importance = target->importance(x, chain->tentative_sample, target->user);
+        if (importance > largest && isfinite(importance)) largest = importance;
+    }
+    return largest;
+}
+
+/* Draws the same states again, keeps each with probability I(x)/max I, and lets it step. */
+static void metroi_flow_fill(metro_chain *chain, void (*step)(const double *, double *, metro_rng *, void *),
+                             uint64_t draws, size_t cells, double *x, double *y, metro_rng rng, double *flow)
+{
+    const metro_target *target = &chain->target;
+    double largest = metroi_largest_importance(chain, draws, x, rng);
+    uint64_t i;
+    for (i = 0; i < draws; i++) {
+        metroi_state_draw(target, x, &rng);
+        if (metro_chain_start_point(chain, x) != METRO_OK) continue;
+        if (metro_rng_uniform(&chain->rng) * largest >= chain->importance) continue;
+        if (step != NULL) step(x, y, &chain->rng, target->user);
+        else {
+            metro_chain_step(chain);
+            memcpy(y, chain->state, metroi_state_doubles(target) * sizeof *y);
+        }
+        metroi_flow_add(target, x, y, cells, flow);
+    }
+}
+
+/* P(chi-square > value): its cube root is nearly normal (Wilson and Hilferty 1931). */
+static double metroi_chi_square_probability(double value, double freedom)
+{
+    double s = 2.0 / (9.0 * freedom);
+    return 0.5 * erfc((cbrt(value / freedom) - 1.0 + s) / sqrt(2.0 * s));
+}
+
+/* Scores one coordinate by eq 7.16. */
+static metro_balance metroi_flow_score(const double *flow, size_t coordinate, size_t cells)
+{
+    metro_balance score;
+    double worst = -1;
+    size_t a, b;
+    memset(&score, 0, sizeof score);
+    score.coordinate = coordinate;
+    score.probability = 1;
+    for (a = 0; a < cells; a++)
+        for (b = a + 1; b < cells; b++) {
+            double there = flow[(coordinate * cells + a) * cells + b];
+            double back = flow[(coordinate * cells + b) * cells + a];
+            double term = (there - back) * (there - back) / (there + back); /* eq 7.16 */
+            if (there + back < 20) continue;
+            score.chi_square += term;
+            score.freedom += 1;
+            if (term <= worst) continue;
+            worst = term;
+            score.from = there > back ? a : b;
+            score.to = there > back ? b : a;
+            score.excess = fabs(there - back) / (there + back);
+        }
+    if (score.freedom > 0) score.probability = metroi_chi_square_probability(score.chi_square, score.freedom);
+    return score;
+}
+
+/* The least probable coordinate, its probability multiplied by the number of coordinates tried. */
+static metro_balance metroi_flow_worst(const double *flow, size_t coordinates, size_t cells)
+{
+    metro_balance worst = metroi_flow_score(flow, 0, cells);
+    size_t i;
+    for (i = 1; i < coordinates; i++) {
+        metro_balance score = metroi_flow_score(flow, i, cells);
+        if (score.probability < worst.probability) worst = score;
+    }
+    worst.probability *= (double)coordinates;
+    if (worst.probability > 1) worst.probability = 1;
+    return worst;
+}
+
+METRO_API metro_result metro_balance_check(const metro_target *target,
+                                           void (*step)(const double *from, double *to, metro_rng *rng, void *user),
+                                           uint64_t draws, size_t cells, metro_rng rng, metro_balance *balance)
+{
+    metro_chain chain;
+    metro_balance worst;
+    size_t doubles, entries, i;
+    double *flow;
+    metro_result result;
+    if (cells == 0) cells = 16;
+    if (cells < 2 || cells > 256) return METRO_ERROR_ARGUMENT;
+    result = metro_chain_make(target, NULL, metro_rng_make(metro_rng_next(&rng), 0), &chain);
+    if (result != METRO_OK) return result;
+    doubles = metroi_state_doubles(target);
+    entries = doubles * cells * cells;
+    flow = NULL;
+    if (doubles <= SIZE_MAX / 64 / (256 * 256)) flow = (double *)METRO_MALLOC((entries + 2 * doubles) * sizeof *flow);
+    if (flow == NULL) {
+        metro_chain_free(&chain);
+        return METRO_ERROR_MEMORY;
+    }
+    for (i = 0; i < entries; i++) flow[i] = 0;
+    metroi_flow_fill(&chain, step, draws, cells, flow + entries, flow + entries + doubles, rng, flow);
+    worst = metroi_flow_worst(flow, doubles, cells);
+    METRO_FREE(flow);
+    metro_chain_free(&chain);
+    if (!(worst.freedom > 0)) return METRO_ERROR_NO_IMPORTANCE;
+    *balance = worst;
+    return METRO_OK;
+}
+
+/* # 7.13 Measuring the start-up error
+
+   Chapter 5 says what E_n is. An ensemble of chains lets us measure it without looking at that chapter. R chains that
+   start alike and run apart are, after n steps, R independent draws from p_n, and the mean of e^{-2 pi i k x} over
+   them is the empirical coefficient of the density. Its square is too large by the noise of the mean; the product of
+   the coefficients of two different groups of chains is not. With J groups, each with the coefficients $c_a(k)$,
+
+       T_{ab} = sum_{k != 0} c_a(k) c_b(-k),    E_n^2 ~ frac{1}{J (J-1)} sum_{a != b} T_{ab}                 (7.17)
+
+   is unbiased: the estimate is 0 in the mean when the chains have forgotten their seed, and is then as often negative
+   as positive. A histogram would have a bias that depends on the width of its bins.
+
+   This is a U-statistic, and the variance of such a mean over pairs can be estimated without bias from the same
+   matrix. The product of two terms with four different groups has mean E_n^4, so
+
+       Var ~ (E_n^2)^2 - frac{C - 4 A + 2 B}{J (J-1) (J-2) (J-3)}                                            (7.18)
+
+   with $A = sum_a (sum_b T_{ab})^2$, $B = sum_{ab} T_{ab}^2$, $C = (sum_{ab} T_{ab})^2$ over pairs of different
+   groups (Hoeffding 1948). Where noise makes eq 7.18 smaller than the part that never vanishes, 2 Var(T)/(J (J-1)),
+   we use that part.
+
+   In d dimensions k is a vector of harmonics, from -K to K on a circle; on an interval the functions are sqrt{2}
+   cos(pi k x) with k from 0 to K. One mode and its conjugate give the same, so one of the two is counted twice. */
+
+/* The modes are listed once: for each the places of its factors in a table of one-dimensional values, and how often
+   its square counts. The table is filled anew for each state, one sine and cosine an axis and then by rotation. */
+
+typedef struct {
+    size_t axes, count;
+    size_t *factor;   /* [count][axes]: places in the table */
+    double *times;    /* [count]: 2 for a mode that stands for its conjugate too, else 1 */
+} metroi_modes;
+
+typedef struct {
+    const metro_ensemble *ensemble;
+    metroi_modes modes;
+    size_t jobs;
+    uint64_t chains;  /* in a job */
+    double *sums;     /* [job][time][mode][2]: sums over the chains of a job */
+} metroi_ensemble;
+
+/* The number of harmonics along an axis, and the product over all axes; 0 when there are too many. */
+static size_t metroi_axis_modes(const metro_axis *axis, size_t harmonics)
+{
+    return axis->kind == METRO_CIRCLE ? 2 * harmonics + 1 : harmonics + 1;
+}
+
+static size_t metroi_mode_count(const metro_target *target, size_t harmonics)
+{
+    const size_t most = (size_t)1 << 20;
+    size_t modes = 1, i;
+    if (harmonics == 0 || harmonics > most) return 0;
+    for (i = 0; i < target->axis_count; i++) {
+        if (target->axes[i].kind == METRO_DIRECTION) return 0;
+        modes *= metroi_axis_modes(&target->axes[i], harmonics);
+        if (modes > most) return 0;
+    }
+    return modes;
+}
+
+/* Writes the places of the factors of the mode with number `mode`, each axis having 2 K + 1 places, the harmonic k at
+   K + k. Returns how often its square counts: 0 for the mean and for the conjugate of another mode, 1 for a mode that
+   is its own conjugate, 2 otherwise. */
+static int metroi_mode_split(const metro_target *target, size_t harmonics, size_t mode, size_t *factor)
+{
+    int first = 0, constant = 1;
+    size_t i;
+    for (i = 0; i < target->axis_count; i++) {
+        size_t count = metroi_axis_modes(&target->axes[i], harmonics), place = mode % count;
+        mode /= count;
+        if (target->axes[i].kind != METRO_CIRCLE) place += harmonics;
+        else if (first == 0 && place != harmonics) first = place > harmonics ? 1 : -1;
+        if (place != harmonics) constant = 0;
+        factor[i] = i * (2 * harmonics + 1) + place;
+    }
+    if (constant || first < 0) return 0;
+    return first > 0 ? 2 : 1;
+}
+
+static void metroi_modes_free(metroi_modes *modes)
+{
+    METRO_FREE(modes->times);
+    METRO_FREE(modes->factor);
+}
+
+static metro_result metroi_modes_make(const metro_target *target, size_t harmonics, metroi_modes *modes)
+{
+    size_t all = metroi_mode_count(target, harmonics), mode;
+    if (all == 0 || target->axis_count > SIZE_MAX / sizeof(size_t) / all) return METRO_ERROR_ARGUMENT;
+    modes->axes = target->axis_count;
+    modes->count = 0;
+    modes->factor = (size_t *)METRO_MALLOC(all * modes->axes * sizeof *modes->factor);
+    modes->times = (double *)METRO_MALLOC(all * sizeof *modes->times);
+    if (modes->factor == NULL || modes->times == NULL) {
+        metroi_modes_free(modes);
+        return METRO_ERROR_MEMORY;
+    }
+    for (mode = 0; mode < all; mode++) {
+        int times = metroi_mode_split(target, harmonics, mode, modes->factor + modes->count * modes->axes);
+        modes->times[modes->count] = times;
+        if (times > 0) modes->count++;
+    }
+    return METRO_OK;
+}
+
+/* Fills the table with e^{-2 pi i k x} on a circle, k from -K to K, and sqrt(2) cos(pi k x) on an interval, k from 0
+   to K: real and imaginary part next to each other. */
+static void metroi_table_fill(const metro_target *target, size_t harmonics, const double *z, double *table)
+{
+    size_t axis, k;
+    for (axis = 0; axis < target->axis_count; axis++) {
+        int circle = target->axes[axis].kind == METRO_CIRCLE;
+        double *middle = table + 2 * (axis * (2 * harmonics + 1) + harmonics);
+        double angle = (circle ? 2 : 1) * METROI_PI * z[axis], c = cos(angle), s = sin(angle), re = 1, im = 0;
+        middle[0] = 1;
+        middle[1] = 0;
+        for (k = 1; k <= harmonics; k++) {
+            double *up = middle + 2 * k, turned = re * c - im * s;
+            im = re * s + im * c;
+            re = turned;
+            up[0] = circle ? re : sqrt(2.0) * re;
+            up[1] = circle ? -im : 0;
+            if (!circle) continue;
+            middle[-2 * (ptrdiff_t)k] = re;
+            middle[1 - 2 * (ptrdiff_t)k] = im;
+        }
+    }
+}
+
+/* Adds the value of each mode, the product of its factors, to its sum. */
+static void metroi_modes_add(const metroi_modes *modes, const double *table, double *sum)
+{
+    const size_t *factor = modes->factor;
+    size_t mode, axis;
+    for (mode = 0; mode < modes->count; mode++, factor += modes->axes) {
+        double re = table[2 * factor[0]], im = table[2 * factor[0] + 1];
+        for (axis = 1; axis < modes->axes; axis++) {
+            const double *f = table + 2 * factor[axis];
+            double turned = re * f[0] - im * f[1];
+            im = re * f[1] + im * f[0];
+            re = turned;
+        }
+        sum[2 * mode] += re;
+        sum[2 * mode + 1] += im;
+    }
+}
+
+/* One chain from a seed, looked at after each of the given numbers of steps. */
+static metro_result metroi_ensemble_chain(const metroi_ensemble *run, metro_chain *chain, double *table, double *sums)
+{
+    const metro_ensemble *ensemble = run->ensemble;
+    uint64_t done = 0;
+    size_t t;
+    metro_result result = metro_chain_start_seeds(chain, ensemble->seed, ensemble->alpha, ensemble->seeds);
+    for (t = 0; t < ensemble->times && result == METRO_OK; t++) {
+        metro_chain_run(chain, ensemble->steps[t] - done);
+        done = ensemble->steps[t];
+        metroi_table_fill(ensemble->target, ensemble->harmonics, chain->state, table);
+        metroi_modes_add(&run->modes, table, sums + 2 * run->modes.count * t);
+    }
+    return result;
+}
+
+static metro_result metroi_ensemble_work(uint64_t job, void *slot, void *user)
+{
+    const metroi_ensemble *run = (const metroi_ensemble *)user;
+    const metro_ensemble *ensemble = run->ensemble;
+    size_t table_size = run->modes.axes * (2 * ensemble->harmonics + 1) * 2 * sizeof(double);
+    metro_chain chain;
+    uint64_t i;
+    double *table;
+    metro_result result = metro_chain_make(ensemble->target, ensemble->options,
+                                           metro_rng_make(ensemble->random_seed, job), &chain);
+    if (result != METRO_OK) return result;
+    chain.target.record = NULL; /* it would be called from several threads */
+    table = (double *)METRO_MALLOC(table_size);
+    if (table == NULL) result = METRO_ERROR_MEMORY;
+    for (i = 0; i < run->chains && result == METRO_OK; i++)
+        result = metroi_ensemble_chain(run, &chain, table, (double *)slot);
+    METRO_FREE(table);
+    metro_chain_free(&chain);
+    return result;
+}
+
+static metro_result metroi_ensemble_merge(uint64_t job, const void *slot, void *user)
+{
+    metroi_ensemble *run = (metroi_ensemble *)user;
+    size_t doubles = 2 * run->modes.count * run->ensemble->times;
+    memcpy(run->sums + (size_t)job * doubles, slot, doubles * sizeof(double));
+    return METRO_OK;
+}
+
+/* T_ab of eq 7.17 at one time. */
+static double metroi_ensemble_product(const metroi_ensemble *run, size_t time, size_t a, size_t b)
+{
+    size_t times = run->ensemble->times, modes = run->modes.count, mode;
+    const double *x = run->sums + 2 * modes * (a * times + time);
+    const double *y = run->sums + 2 * modes * (b * times + time);
+    double n = (double)run->chains, sum = 0;
+    for (mode = 0; mode < modes; mode++)
+        sum += run->modes.times[mode] * (x[2 * mode] * y[2 * mode] + x[2 * mode + 1] * y[2 * mode + 1]);
+    return sum / (n * n);
+}
+
+/* The mean over pairs of groups and its standard error. `row` has a value a group. */
+static void metroi_ensemble_estimate(const metroi_ensemble *run, size_t time, double *row, double *squared,
+                                     double *error)
+{
+    double J = (double)run->jobs, pairs = J * (J - 1), A = 0, B = 0, total = 0, variance, least;
+    size_t a, b;
+    for (a = 0; a < run->jobs; a++) row[a] = 0;
+    for (a = 0; a < run->jobs; a++)
+        for (b = a + 1; b < run->jobs; b++) {
+            double t = metroi_ensemble_product(run, time, a, b);
+            row[a] += t;
+            row[b] += t;
+            B += 2 * t * t;
+        }
+    for (a = 0; a < run->jobs; a++) {
+        A += row[a] * row[a];
+        total += row[a];
+    }
+    *squared = total / pairs; /* eq 7.17 */
+    variance = *squared * *squared - (total * total - 4 * A + 2 * B) / (pairs * (J - 2) * (J - 3)); /* eq 7.18 */
+    least = 2 * (B / pairs - *squared * *squared) / pairs;
+    *error = sqrt(variance > least ? variance : least > 0 ? least : 0);
+}
+
+static int metroi_ensemble_valid(const metro_ensemble *ensemble)
+{
+    size_t t;
+    for (t = 1; t < ensemble->times; t++)
+        if (ensemble->steps[t] < ensemble->steps[t - 1]) return 0;
+    return ensemble->times > 0 && ensemble->chains > 0 && ensemble->seeds > 0 &&
+           (ensemble->jobs == 0 || ensemble->jobs >= 4);
+}
+
+/* Runs all jobs into the sums of `run`, and estimates. */
+static metro_result metroi_ensemble_run(metroi_ensemble *run, double *squared, double *error)
+{
+    const metro_ensemble *ensemble = run->ensemble;
+    size_t doubles = 2 * run->modes.count * ensemble->times, time;
+    metro_rounds plan;
+    metro_result result;
+    if (run->modes.count > SIZE_MAX / 64 / ensemble->times / run->jobs) return METRO_ERROR_ARGUMENT;
+    run->sums = (double *)METRO_MALLOC((doubles + 1) * run->jobs * sizeof *run->sums);
+    if (run->sums == NULL) return METRO_ERROR_MEMORY;
+    memset(&plan, 0, sizeof plan);
+    plan.jobs = run->jobs;
+    plan.slot_size = doubles * sizeof *run->sums;
+    plan.threads = ensemble->threads;
+    plan.work = metroi_ensemble_work;
+    plan.merge = metroi_ensemble_merge;
+    result = metro_rounds_run(&plan, run);
+    for (time = 0; result == METRO_OK && time < ensemble->times; time++)
+        metroi_ensemble_estimate(run, time, run->sums + doubles * run->jobs, &squared[time], &error[time]);
+    METRO_FREE(run->sums);
+    return result;
+}
+
+METRO_API metro_result metro_ensemble_measure(const metro_ensemble *ensemble, double *squared, double *error)
+{
+    metroi_ensemble run;
+    metro_result result;
+    if (!metroi_ensemble_valid(ensemble)) return METRO_ERROR_ARGUMENT;
+    result = metroi_modes_make(ensemble->target, ensemble->harmonics, &run.modes);
+    if (result != METRO_OK) return result;
+    run.ensemble = ensemble;
+    run.jobs = ensemble->jobs > 0 ? ensemble->jobs : 64;
+    run.chains = (ensemble->chains - 1) / run.jobs + 1;
+    result = metroi_ensemble_run(&run, squared, error);
+    metroi_modes_free(&run.modes);
+    return result;
+}
+
+/* # 8 Pictures
+
+   What a method computes is a picture, and whether it computed it well is a number: the distance from a reference.
+   This chapter holds the picture in memory, reads and writes it in the two simplest formats that exist, and measures
+   it. */
+
+/* # 8.1 The picture
+
+   Radiance is a density and a sum of many small parts, so a picture keeps doubles in linear units. Clamping and
+   curves belong to the way it is shown. The one thing to watch is the size: width times height times channels comes
+   from outside and may overflow. */
+
+static int metroi_size_multiply(size_t a, size_t b, size_t *product)
+{
+    if (a != 0 && b > SIZE_MAX / a) return 0;
+    *product = a * b;
+    return 1;
+}
+
+METRO_API metro_result metro_image_make(size_t width, size_t height, size_t channels, metro_image *image)
+{
+    size_t size;
+    double *value;
+    if (image == NULL || width == 0 || height == 0 || (channels != 1 && channels != 3)) return METRO_ERROR_ARGUMENT;
+    if (!metroi_size_multiply(width, height, &size)) return METRO_ERROR_MEMORY;
+    if (!metroi_size_multiply(size, channels * sizeof *value, &size)) return METRO_ERROR_MEMORY;
+    value = (double *)METRO_MALLOC(size);
+    if (value == NULL) return METRO_ERROR_MEMORY;
+    memset(value, 0, size);
+    image->width = width;
+    image->height = height;
+    image->channels = channels;
+    image->value = value;
+    return METRO_OK;
+}
+
+METRO_API void metro_image_free(metro_image *image)
+{
+    if (image == NULL) return;
+    METRO_FREE(image->value);
+    memset(image, 0, sizeof *image);
+}
+
+/* A picture that a caller hands in is worth working on when it has pixels. */
+
+static int metroi_image_holds(const metro_image *image)
+{
+    return image != NULL && image->value != NULL && image->width > 0 && image->height > 0
+        && (image->channels == 1 || image->channels == 3);
+}
+
+METRO_API size_t metro_image_not_finite(const metro_image *image)
+{
+    size_t count = 0, i, samples;
+    if (!metroi_image_holds(image)) return 0;
+    samples = image->width * image->height * image->channels;
+    for (i = 0; i < samples; i++) count += isfinite(image->value[i]) ? 0u : 1u;
+    return count;
+}
+
+/* # 8.2 Colour
+
+   Red, green and blue are those of sRGB (Rec. 709 primaries, white point D65). Luminance weighs them as the eye does;
+   the three weights add up to 1, so grey keeps its value:
+
+       Y = 0.212671 R + 0.715160 G + 0.072169 B                                       (8.1) */
+
+METRO_API double metro_luminance(double red, double green, double blue)
+{
+    return 0.212671 * red + 0.715160 * green + 0.072169 * blue; /* eq 8.1 */
+}
+
+static double metroi_image_luminance(const metro_image *image, size_t pixel)
+{
+    const double *value = image->value + pixel * image->channels;
+    return image->channels == 1 ? value[0] : metro_luminance(value[0], value[1], value[2]);
+}
+
+/* Screens expect values on a curve that spends its 256 steps where the eye sees them: a power, with a straight piece
+   near black, where the power would be infinitely steep (IEC 61966-2-1):
+
+       s(x) = 12.92 x                        "for" x <= 0.0031308
+       s(x) = 1.055 x^{1/2.4} - 0.055        "otherwise"                                         (8.2)
+
+       x(s) = frac{s}{12.92}                          "for" s <= 0.04045
+       x(s) = (frac{s + 0.055}{1.055})^{2.4}          "otherwise"                                (8.3)
+
+   The two thresholds are the published, rounded ones: the pieces do not quite meet, but the gap is less than a
+   hundred-thousandth of one of 256 steps. */
+
+METRO_API double metro_srgb_encode(double linear)
+{
+    return linear <= 0.0031308 ? 12.92 * linear : 1.055 * pow(linear, 1.0 / 2.4) - 0.055; /* eq 8.2 */
+}
+
+METRO_API double metro_srgb_decode(double encoded)
+{
+    return encoded <= 0.04045 ? encoded / 12.92 : pow((encoded + 0.055) / 1.055, 2.4); /* eq 8.3 */
+}
+
+/* # 8.3 Numbers in text
+
+   The functions of the C library that read and write fractions follow the locale: in one half of Europe `strtod`
+   reads `0.5` as 0. So we read digits ourselves. A text is a run of bytes with a place in it, and nothing reads
+   beyond its end. */
+
+typedef struct {
+    const unsigned char *bytes;
+    size_t size, at;
+} metroi_text;
+
+/* The byte at the place, or -1 at the end. */
+static int metroi_text_peek(const metroi_text *text)
+{
+    return text->at < text->size ? text->bytes[text->at] : -1;
+}
+
+static int metroi_is_blank(int byte)
+{
+    return byte == ' ' || (byte >= '\t' && byte <= '\r');
+}
+
+static int metroi_is_digit(int byte)
+{
+    return byte >= '0' && byte <= '9';
+}
+
+/* Moves past white space and past comments, which run from a `#` to the end of the line. */
+static void metroi_text_skip(metroi_text *text)
+{
+    int comment = 0, byte;
+    while ((byte = metroi_text_peek(text)) >= 0 && (comment || byte == '#' || metroi_is_blank(byte))) {
+        comment = byte == '#' || (comment && byte != '\n' && byte != '\r');
+        text->at++;
+    }
+}
+
+/* A number ends where white space, a comment or the end of the text begins; `12x` is none. */
+static int metroi_text_ends(const metroi_text *text)
+{
+    int byte = metroi_text_peek(text);
+    return byte < 0 || byte == '#' || metroi_is_blank(byte);
+}
+
+/* Reads a whole number of at most `most`. Returns 0 when there is none or it is larger. */
+static int metroi_text_whole(metroi_text *text, size_t most, size_t *number)
+{
+    size_t value = 0, digits = 0;
+    metroi_text_skip(text);
+    for (; metroi_is_digit(metroi_text_peek(text)); digits++, text->at++) {
+        size_t digit = (size_t)(text->bytes[text->at] - '0');
+        if (digit > most || value > (most - digit) / 10) return 0;
+        value = 10 * value + digit;
+    }
+    if (digits == 0 || !metroi_text_ends(text)) return 0;
+    *number = value;
+    return 1;
+}
+
+/* A fraction is a whole number times a power of ten. Up to 19 digits fit into 64 bits; further ones only shift the
+   power. Where both parts are doubles without rounding (up to 2^53 and 10^22) their quotient or product is the
+   nearest double (Clinger 1990); elsewhere the last digit or two of the sixteen may be off, which no radiance and no
+   vertex shows. */
+
+static double metroi_decimal(uint64_t digits, long power)
+{
+    double value = (double)digits;
+    if (digits == 0) return 0.0;
+    /* 10^-330 is 0 at once, while digits times 10^-330 need not be: two steps. */
+    if (power < -300) return value * 1e-300 * pow(10.0, (double)(power + 300));
+    return power < 0 ? value / pow(10.0, (double)-power) : value * pow(10.0, (double)power);
+}
+
+/* Reads the digits of a number, with a point among them, as a whole number times 10^power. Returns how many there
+   were. */
+static size_t metroi_text_digits(metroi_text *text, uint64_t *digits, long *power)
+{
+    size_t count = 0, point = 0;
+    for (;; text->at++) {
+        int byte = metroi_text_peek(text);
+        if (byte == '.' && !point) {
+            point = 1;
+        } else if (metroi_is_digit(byte) && count < 1000) {
+            int fits = *digits < UINT64_C(1000000000000000000);
+            if (fits) *digits = 10 * *digits + (uint64_t)(byte - '0');
+            *power += (fits ? 0 : 1) - (point ? 1 : 0);
+            count++;
+        } else {
+            return count;
+        }
+    }
+}
+
+/* Reads a number such as `-1.0`, `.5` or `2e-3`. Returns 0 when there is none; a magnitude too large is infinite. */
+static int metroi_text_real(metroi_text *text, double *number)
+{
+    uint64_t digits = 0;
+    long power = 0, sign;
+    size_t exponent;
+    metroi_text_skip(text);
+    sign = metroi_text_peek(text) == '-' ? -1 : 1;
+    if (sign < 0 || metroi_text_peek(text) == '+') text->at++;
+    if (metroi_text_digits(text, &digits, &power) == 0) return 0;
+    if (metroi_text_peek(text) == 'e' || metroi_text_peek(text) == 'E') {
+        int down;
+        text->at++;
+        down = metroi_text_peek(text) == '-';
+        if (down || metroi_text_peek(text) == '+') text->at++;
+        /* White space here would let `1e 5` through. */
+        if (!metroi_is_digit(metroi_text_peek(text)) || !metroi_text_whole(text, 9999, &exponent)) return 0;
+        power += down ? -(long)exponent : (long)exponent;
+    }
+    if (!metroi_text_ends(text)) return 0;
+    *number = (double)sign * metroi_decimal(digits, power);
+    return 1;
+}
+
+/* # 8.4 Reading
+
+   PPM and PFM are alike: a line of text that says what follows, then the samples.
+
+       P6                    PF                  a colour PFM; Pf is grey
+       # made by hand        640 480             width and height
+       640 480               -1.0                little endian; positive: big endian
+       255                   (4-byte floats, bottom row first)
+       (bytes, top row first)
+
+   In a P3 the samples are decimal numbers, and a PPM with a maxval above 255 has two bytes a sample, the high one
+   first.
+
+   A file is a claim that somebody else makes, so we believe nothing before it is checked: the header, then that all
+   samples are there and that nothing but white space follows them. Only then are the pixels allocated. What is wrong
+   goes back as a sentence in `why`. */
+
+typedef struct {
+    int is_float, is_text, is_big;   /* PFM; P3; PFM with the high byte first */
+    size_t width, height, channels, samples;
+    size_t most;                     /* PPM: maxval */
+    double scale;                    /* PFM: the magnitude of the scale */
+} metroi_header;
+
+/* The kind of file, from its first two bytes. Returns why it is none of ours, or NULL. */
+static const char *metroi_header_kind(metroi_text *text, metroi_header *header)
+{
+    int first = metroi_text_peek(text), second;
+    if (first < 0) return "the file is empty; save the picture again";
+    text->at++;
+    second = metroi_text_peek(text);
+    text->at++;
+    memset(header, 0, sizeof *header);
+    header->is_float = second == 'F' || second == 'f';
+    header->is_text = second == '3';
+    header->channels = second == 'f' ? 1 : 3;
+    if (first != 'P' || !(header->is_float || header->is_text || second == '6') || !metroi_text_ends(text))
+        return "the file begins with none of P6, P3, PF and Pf; convert the picture to PPM or PFM";
+    return NULL;
+}
+
+/* The size, and how many samples it makes. More samples than the file has bytes are a lie in every format, and a
+   product that overflows is one too. */
+static const char *metroi_header_size(metroi_text *text, metroi_header *header)
+{
+    const size_t most = SIZE_MAX / 16;
+    size_t pixels;
+    if (!metroi_text_whole(text, most, &header->width) || !metroi_text_whole(text, most, &header->height))
+        return "the header has no width and height that are whole numbers of a possible size; save the picture again";
+    if (header->width == 0 || header->height == 0) return "the picture has no pixels: its width or height is 0";
+    if (!metroi_size_multiply(header->width, header->height, &pixels)
+        || !metroi_size_multiply(pixels, header->channels, &header->samples) || header->samples > text->size)
+        return "the header asks for more pixels than the file holds: the file was cut off or its size is wrong";
+    return NULL;
+}
+
+/* The last number of the header, and the one byte of white space behind it. */
+static const char *metroi_header_range(metroi_text *text, metroi_header *header)
+{
+    double scale = 0;
+    if (header->is_float) {
+        if (!metroi_text_real(text, &scale) || !isfinite(scale) || scale == 0)
+            return "the third line of a PFM must be its scale, a finite number other than 0 such as -1.0";
+        header->is_big = scale > 0;
+        header->scale = fabs(scale);
+    } else if (!metroi_text_whole(text, 65535, &header->most) || header->most == 0) {
+        return "the maxval of a PPM must be a whole number from 1 to 65535";
+    }
+    if (!metroi_is_blank(metroi_text_peek(text)))
+        return "the header does not end in white space: the file was cut off or is damaged";
+    text->at++;
+    return NULL;
+}
+
+/* One sample of a PFM: the bits of a float, whichever way round. */
+static double metroi_read_float(const unsigned char *byte, const metroi_header *header)
+{
+    int big = header->is_big;
+    uint32_t bits = (uint32_t)byte[big ? 3 : 0] | (uint32_t)byte[big ? 2 : 1] << 8
+        | (uint32_t)byte[big ? 1 : 2] << 16 | (uint32_t)byte[big ? 0 : 3] << 24;
+    float value;
+    memcpy(&value, &bits, sizeof value);
+    return (double)value * header->scale;
+}
+
+/* Moves past one sample and reads it. Returns why it cannot be read, or NULL. */
+static const char *metroi_read_sample(metroi_text *text, const metroi_header *header, double *value)
+{
+    const char *cut_off = "the file ends before its last pixel: it was cut off or the size in its header is wrong";
+    const char *damaged = "a sample is not a whole number from 0 to the maxval of the header: the file is damaged";
+    size_t width = header->is_float ? 4 : header->most > 255 ? 2 : 1, number;
+    if (header->is_text) {
+        metroi_text_skip(text);
+        if (text->at == text->size) return cut_off;
+        if (!metroi_text_whole(text, header->most, &number)) return damaged;
+    } else {
+        const unsigned char *byte = text->bytes + text->at;
+        if (text->size - text->at < width) return cut_off;
+        text->at += width;
+        if (header->is_float) {
+            *value = metroi_read_float(byte, header);
+            return NULL;
+        }
+        number = width == 2 ? (size_t)byte[0] << 8 | byte[1] : byte[0];
+        if (number > header->most) return damaged;
+    }
+    *value = (double)number / (double)header->most;
+    return NULL;
+}
+
+/* Goes through all samples without keeping any, then looks for what does not belong behind them. */
+static const char *metroi_raster_check(metroi_text text, const metroi_header *header)
+{
+    size_t i;
+    double value;
+    for (i = 0; i < header->samples; i++) {
+        const char *why = metroi_read_sample(&text, header, &value);
+        if (why != NULL) return why;
+    }
+    if (header->is_text) metroi_text_skip(&text);
+    while (metroi_is_blank(metroi_text_peek(&text))) text.at++;
+    return text.at < text.size ? "the file goes on after its last pixel: the size in its header is wrong" : NULL;
+}
+
+/* Reads the samples, which are known to be good, into `image`: the first row of a PFM is the bottom one. */
+static void metroi_raster_read(metroi_text text, const metroi_header *header, metro_image *image)
+{
+    size_t row = header->width * header->channels, y, i;
+    for (y = 0; y < header->height; y++) {
+        double *value = image->value + row * (header->is_float ? header->height - 1 - y : y);
+        for (i = 0; i < row; i++) {
+            metroi_read_sample(&text, header, &value[i]);
+            if (!header->is_float) value[i] = metro_srgb_decode(value[i]);
+        }
+    }
+}
+
+static metro_result metroi_image_parse(const unsigned char *bytes, size_t size, metro_image *image, const char **why)
+{
+    metroi_text text;
+    metroi_header header;
+    text.bytes = bytes;
+    text.size = size;
+    text.at = 0;
+    *why = metroi_header_kind(&text, &header);
+    if (*why == NULL) *why = metroi_header_size(&text, &header);
+    if (*why == NULL) *why = metroi_header_range(&text, &header);
+    if (*why == NULL) *why = metroi_raster_check(text, &header);
+    if (*why != NULL) return METRO_ERROR_FORMAT;
+    if (metro_image_make(header.width, header.height, header.channels, image) != METRO_OK) {
+        *why = "there is not enough memory for the pixels; use a smaller picture";
+        return METRO_ERROR_MEMORY;
+    }
+    metroi_raster_read(text, &header, image);
+    return METRO_OK;
+}
+
+/* Copies `part` to the place `at` of the message, as far as it fits with its closing zero. Returns the place behind
+   it. */
+static size_t metroi_tell_part(char *message, size_t message_size, size_t at, const char *part)
+{
+    while (*part != 0 && at + 1 < message_size) message[at++] = *part++;
+    message[at] = 0;
+    return at;
+}
+
+/* The message names the file, where there is one, and why it was refused; on success it is empty. */
+static void metroi_tell(char *message, size_t message_size, const char *path, const char *why)
+{
+    size_t at = 0;
+    if (message == NULL || message_size == 0) return;
+    message[0] = 0;
+    if (why == NULL) return;
+    if (path != NULL) {
+        at = metroi_tell_part(message, message_size, at, path);
+        at = metroi_tell_part(message, message_size, at, ": ");
+    }
+    metroi_tell_part(message, message_size, at, why);
+}
+
+METRO_API metro_result metro_image_parse(const unsigned char *bytes, size_t size, metro_image *image, char *message,
+                                         size_t message_size)
+{
+    const char *why = "no bytes or no picture was given; see the contract of metro_image_parse";
+    metro_result result = METRO_ERROR_ARGUMENT;
+    if (image != NULL && (bytes != NULL || size == 0)) result = metroi_image_parse(bytes, size, image, &why);
+    metroi_tell(message, message_size, NULL, why);
+    return result;
+}
+
+/* A file is read whole, into memory of its own size. The first byte is read before anything else: a folder can be
+   opened but not read, and claims the largest size there is. */
+
+static metro_result metroi_file_read(FILE *file, unsigned char **bytes, size_t *size, const char **why)
+{
+    long end;
+    *why = "the file cannot be read; check that it is an ordinary file and that its disk is there";
+    (void)fgetc(file);
+    if (ferror(file) || fseek(file, 0, SEEK_END) != 0 || (end = ftell(file)) < 0 || fseek(file, 0, SEEK_SET) != 0)
+        return METRO_ERROR_FILE;
+    *size = (size_t)end;
+    *bytes = (unsigned char *)METRO_MALLOC(*size + 1);
+    if (*bytes == NULL) {
+        *why = "there is not enough memory for the file; use a smaller picture";
+        return METRO_ERROR_MEMORY;
+    }
+    *size = fread(*bytes, 1, *size, file);
+    if (ferror(file)) return METRO_ERROR_FILE;
+    *why = NULL;
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_image_load(const char *path, metro_image *image, char *message, size_t message_size)
+{
+    const char *why = "no path or no picture was given; see the contract of metro_image_load";
+    metro_result result = METRO_ERROR_ARGUMENT;
+    unsigned char *bytes = NULL;
+    size_t size = 0;
+    if (path != NULL && image != NULL) {
+        FILE *file = fopen(path, "rb");
+        why = "the file cannot be opened; check that it exists and that you may read it";
+        result = file == NULL ? METRO_ERROR_FILE : metroi_file_read(file, &bytes, &size, &why);
+        if (file != NULL) fclose(file);
+        if (result == METRO_OK) result = metroi_image_parse(bytes, size, image, &why);
+        METRO_FREE(bytes);
+    }
+    metroi_tell(message, message_size, path, why);
+    return result;
+}
+
+/* # 8.5 Writing
+
+   A long run that is killed while it saves, or a disk that is full, must not leave half a picture where a whole one
+   was. So we write a sibling, `PATH.tmp`, and rename it when every byte has arrived: within a folder a rename happens
+   at once or not at all. A device or a pipe is not replaced (a program that runs as root would otherwise put a file
+   where /dev/null was) but written to. */
+
+typedef struct {
+    FILE *file;
+    const char *path;
+    char *sibling; /* NULL: written directly */
+} metroi_output;
+
+#ifdef _WIN32
+static int metroi_is_special(const char *path)
+{
+    (void)path;
+    return 0;
+}
+#else
+#include <sys/stat.h>
+static int metroi_is_special(const char *path)
+{
+    struct stat status;
+    return stat(path, &status) == 0 && !S_ISREG(status.st_mode);
+}
+#endif
+
+static metro_result metroi_output_open(const char *path, metroi_output *output)
+{
+    size_t length = strlen(path);
+    output->path = path;
+    output->sibling = NULL;
+    if (!metroi_is_special(path)) {
+        output->sibling = (char *)METRO_MALLOC(length + 5);
+        if (output->sibling == NULL) return METRO_ERROR_MEMORY;
+        memcpy(output->sibling, path, length);
+        memcpy(output->sibling + length, ".tmp", 5);
+    }
+    output->file = fopen(output->sibling != NULL ? output->sibling : path, "wb");
+    if (output->file != NULL) return METRO_OK;
+    METRO_FREE(output->sibling);
+    return METRO_ERROR_FILE;
+}
+
+/* Closes the file and puts it in its place. A full disk may show only here, when the last block is written. */
+static metro_result metroi_output_close(metroi_output *output)
+{
+    int good = !ferror(output->file);
+    good = fclose(output->file) == 0 && good;
+    if (output->sibling != NULL) {
+#ifdef _WIN32
+        if (good) remove(output->path); /* rename does not replace there */
+#endif
+        good = good && rename(output->sibling, output->path) == 0;
+        if (!good) remove(output->sibling);
+        METRO_FREE(output->sibling);
+    }
+    return good ? METRO_OK : METRO_ERROR_FILE;
+}
+
+/* The four bytes of a float, the low one first. A double beyond the range of float has no defined conversion. */
+static void metroi_write_float(double value, unsigned char byte[4])
+{
+    const double largest = 3.4028234663852886e38; /* (2 - 2^-23) 2^127 */
+    float single = 0;
+    uint32_t bits;
+    if (fabs(value) > largest) bits = value > 0 ? 0x7f800000u : 0xff800000u;
+    else {
+        single = (float)value;
+        memcpy(&bits, &single, sizeof bits);
+    }
+    byte[0] = (unsigned char)(bits & 255);
+    byte[1] = (unsigned char)(bits >> 8 & 255);
+    byte[2] = (unsigned char)(bits >> 16 & 255);
+    byte[3] = (unsigned char)(bits >> 24);
+}
+
+/* The nearest of 256 steps on the sRGB curve. The comparison is turned so that NaN fails it and becomes black. */
+static unsigned char metroi_write_byte(double value)
+{
+    if (!(value > 0)) return 0;
+    return value >= 1 ? 255 : (unsigned char)(255.0 * metro_srgb_encode(value) + 0.5); /* eq 8.2 */
+}
+
+METRO_API metro_result metro_image_save_pfm(const metro_image *image, const char *path)
+{
+    metroi_output output;
+    metro_result result;
+    size_t row, y, i;
+    if (!metroi_image_holds(image) || path == NULL) return METRO_ERROR_ARGUMENT;
+    result = metroi_output_open(path, &output);
+    if (result != METRO_OK) return result;
+    row = image->width * image->channels;
+    fprintf(output.file, "%s\n%lu %lu\n-1.0\n", image->channels == 1 ? "Pf" : "PF", (unsigned long)image->width,
+            (unsigned long)image->height);
+    for (y = image->height; y-- > 0;) {
+        for (i = 0; i < row; i++) {
+            unsigned char byte[4];
+            metroi_write_float(image->value[y * row + i], byte);
+            fwrite(byte, 1, 4, output.file);
+        }
+    }
+    return metroi_output_close(&output);
+}
+
+METRO_API metro_result metro_image_save_ppm(const metro_image *image, const char *path)
+{
+    metroi_output output;
+    metro_result result;
+    size_t pixel, pixels, c;
+    if (!metroi_image_holds(image) || path == NULL) return METRO_ERROR_ARGUMENT;
+    result = metroi_output_open(path, &output);
+    if (result != METRO_OK) return result;
+    pixels = image->width * image->height;
+    fprintf(output.file, "P6\n%lu %lu\n255\n", (unsigned long)image->width, (unsigned long)image->height);
+    for (pixel = 0; pixel < pixels; pixel++) {
+        unsigned char byte[3];
+        for (c = 0; c < 3; c++)
+            byte[c] = metroi_write_byte(image->value[pixel * image->channels + (image->channels == 1 ? 0 : c)]);
+        fwrite(byte, 1, 3, output.file);
+    }
+    return metroi_output_close(&output);
+}
+
+/* # 8.6 The error of a picture
+
+   Two numbers, because each hides something. The relative root mean square error compares energies: a lamp in the
+   picture decides it alone.
+
+       epsilon = sqrt{frac{sum (I - R)^2}{sum R^2}}                                   (8.4)
+
+   relMSE weighs each pixel by its own brightness, as the eye does. With $X$ the luminance of the picture and $Y$ that
+   of the reference, the second term of the denominator keeps the pixels that are nearly black from ruling:
+
+       "relMSE" = frac{1}{n} sum_{j=1}^{n} frac{(X_j - Y_j)^2}{Y_j^2 + 0.01 m^2},
+       m = frac{1}{n} sum_{j=1}^{n} Y_j                                               (8.5)
+
+   A reference is itself a long run, and where it is off by its own noise of variance $V_j$ the error of even a
+   perfect picture is not 0 but, in the mean,
+
+       "noise" = frac{1}{n} sum_{j=1}^{n} frac{V_j}{Y_j^2 + 0.01 m^2}                 (8.6)
+
+   which is to be subtracted. The relMSE of an unbiased method falls as one over its time, so 1 / (relMSE seconds) is
+   its efficiency, whatever time it was given; a method whose efficiency falls is held back by something that time
+   does not cure. */
+
+static int metroi_images_alike(const metro_image *a, const metro_image *b)
+{
+    return metroi_image_holds(a) && metroi_image_holds(b) && a->width == b->width && a->height == b->height;
+}
+
+static double metroi_image_mean(const metro_image *image)
+{
+    metro_sum sum = { 0, 0 };
+    size_t pixel, pixels = image->width * image->height;
+    for (pixel = 0; pixel < pixels; pixel++) metro_sum_add(&sum, metroi_image_luminance(image, pixel));
+    return metro_sum_value(&sum) / (double)pixels;
+}
+
+/* The denominator of eq 8.5 in one pixel. */
+static double metroi_relmse_unit(const metro_image *reference, size_t pixel, double mean)
+{
+    double y = metroi_image_luminance(reference, pixel);
+    return y * y + 0.01 * mean * mean;
+}
+
+/* The largest difference of a sample. A NaN wins against every number and stays. */
+static void metroi_difference_largest(const metro_image *a, const metro_image *b, metro_image_difference *difference)
+{
+    size_t i, samples = a->width * a->height * a->channels;
+    difference->largest = 0;
+    difference->x = difference->y = 0;
+    for (i = 0; i < samples && !isnan(difference->largest); i++) {
+        double size = fabs(a->value[i] - b->value[i]);
+        if (size <= difference->largest) continue;
+        difference->largest = size;
+        difference->x = i / a->channels % a->width;
+        difference->y = i / a->channels / a->width;
+    }
+}
+
+METRO_API metro_result metro_image_error(const metro_image *image, const metro_image *reference,
+                                         metro_image_difference *difference)
+{
+    metro_sum error = { 0, 0 }, energy = { 0, 0 }, relative = { 0, 0 };
+    size_t i, pixels;
+    if (difference == NULL || !metroi_images_alike(image, reference) || image->channels != reference->channels)
+        return METRO_ERROR_ARGUMENT;
+    pixels = image->width * image->height;
+    difference->mean = metroi_image_mean(image);
+    difference->mean_reference = metroi_image_mean(reference);
+    for (i = 0; i < pixels * image->channels; i++) {
+        double off = image->value[i] - reference->value[i];
+        metro_sum_add(&error, off * off);
+        metro_sum_add(&energy, reference->value[i] * reference->value[i]);
+    }
+    for (i = 0; i < pixels; i++) {
+        double off = metroi_image_luminance(image, i) - metroi_image_luminance(reference, i);
+        metro_sum_add(&relative, off * off / metroi_relmse_unit(reference, i, difference->mean_reference));
+    }
+    difference->relative_rmse = sqrt(metro_sum_value(&error) / metro_sum_value(&energy)); /* eq 8.4 */
+    difference->relmse = metro_sum_value(&relative) / (double)pixels;                     /* eq 8.5 */
+    metroi_difference_largest(image, reference, difference);
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_image_noise(const metro_image *reference, const metro_image *variance, double *relmse)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i, pixels;
+    double mean;
+    if (relmse == NULL || !metroi_images_alike(reference, variance)) return METRO_ERROR_ARGUMENT;
+    pixels = reference->width * reference->height;
+    mean = metroi_image_mean(reference);
+    for (i = 0; i < pixels; i++)
+        metro_sum_add(&sum, metroi_image_luminance(variance, i) / metroi_relmse_unit(reference, i, mean));
+    *relmse = metro_sum_value(&sum) / (double)pixels; /* eq 8.6 */
+    return METRO_OK;
+}
+
+#undef METROI_PI
+#undef METROI_NAN
+#undef METROI_INFINITY
+
+#ifdef __cplusplus
+}
+#endif
+
+/* # A Equations of the paper
+
+   Every numbered equation of Szirmay-Kalos, Dornbach and Purgathofer (1999): where it stands here, what was wrong
+   with it, and which function computes it. The evidence for each erratum stands beside its equation.
+
+   | paper | here | erratum | code |
+   | paper (1) | eq 7.1 | sigma is called the variance of the estimation; it is the standard deviation of f/p, and sigma/sqrt(M) the standard error | `metro_moments_error` |
+   | paper (2) | eq 4.1 | equality holds in stationarity only, and needs I > 0 wherever f is not 0; b is one more unknown | `metro_chain_run`, `metro_chain_b` |
+   | paper (3) | eq 5.1 | P(x -> y) under the integral must be P(y -> x), over one period | `metro_kernel_density` |
+   | paper (4) | eq 5.2 | none | `metro_kernel_coefficient` |
+   | paper (5) | eq 5.3 | e^{jkx} belongs to a period of 2 pi; the rest of the paper uses the unit period, e^{2 pi jkx} | `metro_startup_density` |
+   | paper (6) | eq 5.4 | none: the comb of deltas is the list of coefficients | `metro_kernel_coefficient` |
+   | paper (7) | eq 5.4 | none | `metro_kernel_coefficient` |
+   | paper (8) | eq 5.5 | none | `metro_startup_density` |
+   | paper (9) | eq 5.5 | period, as (5) | `metro_startup_density` |
+   | paper (10) | eq 5.6 | a_0 is 1 on the unit period that the integral is taken over | `metro_operator_distance` |
+   | paper (11) | eq 5.3 | 1/(2 pi) times the integral over [-pi, pi] is 1/(2 pi), not 1; on the unit period a_0 is the integral of p_n, which is 1 | `metro_startup_density` |
+   | paper (12) | eq 5.7 | right on the unit period for n >= 1; infinite for n = 0; on a period of 2 pi it needs a factor 1/sqrt(2 pi) | `metro_startup_error` |
+   | paper (13) | eq 5.28 | none | `metro_chain_start_seeds` |
+   | paper (14) | eq 5.30 | period, as (5) | `metro_startup_density` |
+   | paper (15) | eq 5.31 | the sum over the seeds does not belong inside the power 2n, and x has no place in it | `metro_startup_error_seeds` |
+   | paper (16) | eq 5.16 | the condition must be abs(x - y) < Delta/2; as printed the density integrates to 2 | `metro_kernel_density` |
+   | paper (17) | eq 5.17 | right on the unit period, for Delta > 1 too | `metro_kernel_coefficient` |
+   | paper (18) | eq 7.1 | the sum runs to M - 1 with weights 1 - k/M, holds in stationarity, and gives a standard deviation | `metro_bernstein` |
+   | paper (19) | chapter 1 | the transport by bundles of rays is not part of the chapters above | none |
+
+   The printed algorithm of section 1.1 has the transition probabilities of its quotient exchanged: eq 4.2. Section
+   2.3 asks for many more mutations than 1/Delta; diffusion needs many more than 1/Delta^2: eq 5.18. The apex angle of
+   section 3.2 is the full angle of a cone, twice the half-angle of `metro_cone_perturb`.
+
+   # B Symbols
+
+   The letters of the paper and the names of the code. Inside a function the paper's letter is used where it is
+   declared with its meaning.
+
+   | paper | meaning | code |
+   | z, z_i | a state of the chain, the state after i steps | `metro_chain.state` |
+   | f(z) | the integrand, a vector | what `metro_target.record` adds, divided by I |
+   | I(z) | the importance, a number | `metro_target.importance` |
+   | b | the integral of I | `metro_chain_b` |
+   | M | the number of mutations | `steps` |
+   | T(i -> t) | the density of the tentative transition | `metro_target.propose`, `metro_kernel_density` |
+   | a(i -> t) | the probability of acceptance | `metroi_acceptance` |
+   | p_n | the density of the n-th state | `metro_startup_density` |
+   | P(x - y), P* | a perturbation and its spectrum | `metro_kernel_density`, `metro_kernel_coefficient` |
+   | Delta | the full width of a uniform perturbation | `metro_kernel.size` |
+   | E_n | the start-up error, the L2 distance of p_n from its limit | `metro_startup_error` |
+   | x_i, alpha_i | the seeds and their probabilities | `seed`, `alpha` |
+   | sigma | the standard deviation of f/p | `metro_moments_variance` is its square |
+   | R(k), rho_k | the correlation at lag k | `metro_autocorrelation` |
+
+   # C License
+
+   MIT No Attribution. Copyright (c) 2026 The metro.h authors.
+
+   Permission is hereby granted, free of charge, to any person obtaining a copy of this software and associated
+   documentation files (the "Software"), to deal in the Software without restriction, including without limitation the
+   rights to use, copy, modify, merge, publish, distribute, sublicense, and/or sell copies of the Software, and to
+   permit persons to whom the Software is furnished to do so.
+
+   THE SOFTWARE IS PROVIDED "AS IS", WITHOUT WARRANTY OF ANY KIND, EXPRESS OR IMPLIED, INCLUDING BUT NOT LIMITED TO
+   THE WARRANTIES OF MERCHANTABILITY, FITNESS FOR A PARTICULAR PURPOSE AND NONINFRINGEMENT. IN NO EVENT SHALL THE
+   AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMAGES OR OTHER LIABILITY, WHETHER IN AN ACTION OF CONTRACT,
+   TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE
+   SOFTWARE. */
+
+#endif /* METRO_IMPLEMENTATION */
