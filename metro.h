@@ -822,8 +822,9 @@ typedef struct {
 /* Takes bias and variance of an estimate apart (eq 7.13, eq 7.14). `estimate` holds repeats * values numbers: all
    values (the samples of a picture, say) of the first run, then of the second; `truth` holds the true values. The
    errors are standard errors by the jackknife over runs, so that the values of one run may depend on each other;
-   where there is no bias, `bias2_error` is too large by sqrt(2 (repeats - 1)/(repeats - 2)). Under two repeats bias^2
-   and variance are NaN, under three so are their errors, and under two the error of the mean squared error. NaN or an
+   where there is no bias, `bias2_error` is too large by sqrt(2 (repeats - 1)/(repeats - 2)). Of a few values only it
+   says little where their bias happens to be near 0: look at the signed bias then. Under two repeats bias^2 and
+   variance are NaN, under three so are their errors, and under two the error of the mean squared error. NaN or an
    infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or a
    NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
    Source: Quenouille (1956), Efron and Stein (1981). */
@@ -2813,6 +2814,9 @@ METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t can
    A burn-in throws the first samples away. Whether that pays is measured in chapter 5 and in the example `startup`:
    it removes bias and variance's samples alike.
 
+   [figure: startup.svg | All start-up policies at equal cost: squared bias and variance of a small picture against
+   the evaluations spent.]
+
    b is the mean importance of independent draws, wherever they come from: candidates, large steps, or a survey made
    for it. */
 
@@ -2838,6 +2842,16 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
     if (error != NULL) *error = metro_moments_error(&chain->normalisation);
     return metro_moments_mean(&chain->normalisation);
 }
+
+/* Chapters 5 to 8 are compiled at -O1 by gcc, where it would use more. That saves a third of the time that a lesson
+   takes to compile, and no time that `make bench` measures changes. What is compiled without optimization stays so.
+   */
+
+#if defined(__GNUC__) && !defined(__clang__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
+#define METROI_COMPILE_FAST
+#pragma GCC push_options
+#pragma GCC optimize("O1")
+#endif
 
 /* # 5 Start-up theory
 
@@ -2867,6 +2881,9 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
    # 5.2 The series and the error
 
    A density on the circle of length 1 is the sum of its harmonics,
+
+   [figure: fig1.svg | The density after n steps: exact curves over histograms of an ensemble (figure 1 of the
+   paper).]
 
        p_n(x) = sum_{k=-inf}^{inf} a_k^{(n)} e^{2 pi i k x}
        a_k^{(n)} = int_{0}^{1} p_n(x) e^{-2 pi i k x} dx                              (5.3)
@@ -3092,6 +3109,9 @@ static double metroi_spectrum_tail(const metroi_spectrum *spectrum, double s, do
 
    One loop serves them all:
 
+   [figure: accuracy.svg | What accuracy costs: error against time for the series and the library, the operator, an
+   ensemble, and the size of the perturbation.]
+
        S = sum_{k=1}^{inf} P(k/T)^s w_k, w_k = cos(2 pi k x/T) "or" abs(A_k)^2        (5.13)
 
    The weights are those of a point x, or those of a set of seeds (section 5.11). Beside S we keep S', the same sum of
@@ -3169,8 +3189,8 @@ static double metroi_reach(const metro_kernel *k, double s)
 {
     double c = k->size;
     switch (k->shape) {
-    case METRO_UNIFORM: return c * (s < 33 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
-    case METRO_TRIANGLE: return 0.5 * c * (s < 16.5 ? s : 0.5 + sqrt(16 * s));
+    case METRO_UNIFORM: return c * (s < 34 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
+    case METRO_TRIANGLE: return 0.5 * c * (s < 17 ? s : 0.5 + sqrt(16 * s));
     case METRO_GAUSSIAN: return 9.5 * c * sqrt(s);
     case METRO_VON_MISES: return c < METROI_SMOOTH_KAPPA ? METROI_INFINITY : 10 * sqrt(s / c) / (2 * METROI_PI);
     case METRO_KELEMEN: return c * (s < 146 ? s : 1 + 12 * sqrt(s));
@@ -3196,6 +3216,9 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
 /* # 5.7 Uniform perturbations
 
    The tentative sample is uniform in an interval of width Delta around the current one,
+
+   [figure: fig2.svg | The start-up error against the number of steps for perturbations of different width, with
+   estimates from ensembles of chains (figure 2 of the paper).]
 
        P(x - y) = 1/Delta "for" abs(x - y) < Delta/2, "else" 0                        (5.16)
 
@@ -3504,6 +3527,8 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
    One way to reduce the start-up error is to start at one of several seeds x_i, chosen with the probability alpha_i,
    paper (13):
 
+   [figure: seeds.svg | The corrected formula for several seeds, the printed one, and what chains do.]
+
        p_0(x) = sum_{i=1}^{N} alpha_i delta(x - x_i), sum_{i=1}^{N} alpha_i = 1       (5.28)
 
    The coefficients of p_0 are
@@ -3532,10 +3557,11 @@ static double metroi_seed_weight(const metroi_seeds *seeds, size_t i)
     return seeds->alpha != NULL ? seeds->alpha[i] : 1 / (double)seeds->count;
 }
 
-/* abs(A_k)^2 */
+/* abs(A_k)^2. The sums are compensated: where seeds cancel in pairs, nothing is left. */
 static double metroi_seed_power(const metroi_seeds *seeds, double k)
 {
-    double real = 0, imaginary = 0, turns, sine, cosine, alpha;
+    metro_sum real = { 0, 0 }, imaginary = { 0, 0 };
+    double turns, sine, cosine, alpha, re, im;
     int quadrant;
     size_t i;
     for (i = 0; i < seeds->count; i++) {
@@ -3545,10 +3571,12 @@ static double metroi_seed_power(const metroi_seeds *seeds, double k)
         alpha = metroi_seed_weight(seeds, i);
         /* a quarter turn exchanges sine and cosine */
         if (quadrant & 2) alpha = -alpha;
-        real += quadrant & 1 ? -alpha * sine : alpha * cosine;
-        imaginary += quadrant & 1 ? alpha * cosine : alpha * sine;
+        metro_sum_add(&real, quadrant & 1 ? -alpha * sine : alpha * cosine);
+        metro_sum_add(&imaginary, quadrant & 1 ? alpha * cosine : alpha * sine);
     }
-    return real * real + imaginary * imaginary; /* eq 5.29 */
+    re = metro_sum_value(&real);
+    im = metro_sum_value(&imaginary);
+    return re * re + im * im; /* eq 5.29 */
 }
 
 /* Seeds as a user gives them: some, all finite, with weights that are not negative and sum to 1. */
@@ -3719,6 +3747,8 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
    much. If a step perturbs all d coordinates at once and independently, the density of the state is the product of
    those of its coordinates, and with e_j the start-up error of coordinate j
 
+   [figure: fig2_dimensions.svg | The start-up error in one, two, three and five dimensions.]
+
        1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.35)
 
    While the e_j are large, the error grows like their product; when they are small, only like sqrt(d). We evaluate eq
@@ -3760,7 +3790,7 @@ METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes
 
 /* # 5.14 The running mean
 
-   A picture averages all samples so far. A sample picked at random among the M after a burn-in of b - 1 has the
+   A picture averages all samples so far. A sample picked at random among the M that follow a burn-in of b has the
    density (p_b + .. + p_{b+M-1})/M, and by eq 5.5 its coefficients are geometric sums:
 
        S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.37)
@@ -3789,9 +3819,10 @@ METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes
 
 typedef struct {
     const metro_kernel *kernel;
-    double burn, steps, keep; /* b, M, and 1 - p */
+    double burn, steps;           /* b, M */
+    double large, keep, log_keep; /* p, 1 - p, and its logarithm */
+    double last;                  /* J - 2b: so many powers, and one, are taken out; -1: none */
     int odd_steps;
-    double last;              /* J - 2b: so many powers, and one, are taken out; -1: none */
 } metroi_mean;
 
 /* c_s as a function of i = s - 2b */
@@ -3829,10 +3860,10 @@ static double metroi_mean_geometric(const metroi_mean *mean, double at, int sign
 {
     double gap, power;
     *v = sign * mean->keep * exp(at);
-    gap = sign > 0 ? (1 - mean->keep) - mean->keep * expm1(at) : 1 - *v;
+    gap = sign > 0 ? mean->large - mean->keep * expm1(at) : 1 - *v;
     if (gap == 0) return mean->steps;
     if (*v > 0.5) return -expm1(mean->steps * log1p(-gap)) / gap;
-    power = exp(mean->steps * (at + log(mean->keep)));
+    power = exp(mean->steps * (at + mean->log_keep));
     return (sign < 0 && mean->odd_steps ? 1 + power : 1 - power) / gap;
 }
 
@@ -3844,53 +3875,66 @@ static double metroi_mean_geometric(const metroi_mean *mean, double at, int sign
    Uniform and triangular modes obey the first up to the first zero of P, and from there on, as Kelemen's do from the
    start, with a bound abs(P) <= x on all modes from k on, x falling like 1/k, 1/k^2 and 1/k,
 
-       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.43) */
+       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.43)
+
+   with 2 J + 1 for the J under k where x falls like 1/k^2. */
+
+/* eq 5.42 with `share` for k/3, and eq 5.43 with x = `bound` falling like 1/k^fall; logarithms. */
+
+static double metroi_mean_near(const metroi_mean *mean, double share, double at)
+{
+    return log(share) + 2 * (mean->burn * at - log(-mean->keep * expm1(at)));
+}
+
+static double metroi_mean_far(const metroi_mean *mean, double k, double bound, double fall)
+{
+    double power = 2 * mean->burn + mean->last; /* J */
+    if (!(bound < 0.5)) return METROI_INFINITY;
+    return (power + 1) * log(bound) + log(k / (fall * (power + 1) - 1))
+         + log((mean->last + 2) / (1 - bound) + bound / ((1 - bound) * (1 - bound)));
+}
+
+/* Kelemen's modes up to 4 C T are none above X, eq 5.11, and beyond they fall. */
+static double metroi_mean_kelemen_tail(const metroi_mean *mean, double period, double k)
+{
+    double scale = metroi_kelemen_bound(mean->kernel) * period, edge = 4 * scale, top;
+    if (k >= edge) return metroi_mean_far(mean, k, scale / k, 1);
+    top = metroi_kelemen_ceiling(mean->kernel, k / period);
+    if (!(top < 0)) return METROI_INFINITY;
+    return log(2) + fmax(metroi_mean_near(mean, edge, top), metroi_mean_far(mean, edge, 0.25, 1));
+}
 
 static double metroi_mean_tail(const metroi_mean *mean, const metroi_spectrum *spectrum, double k, double at)
 {
-    const metro_kernel *kernel = mean->kernel;
-    double near = -METROI_INFINITY, far = near, power = 2 * mean->burn + mean->last, h = 0, x, falls = power;
-    switch (kernel->shape) {
-    case METRO_UNIFORM: h = kernel->size / spectrum->period; break;
-    case METRO_TRIANGLE: h = kernel->size / 2 / spectrum->period; break;
-    case METRO_KELEMEN: break;
+    double near = -METROI_INFINITY, h = mean->kernel->size / spectrum->period, fall = 1, x;
+    switch (mean->kernel->shape) {
     case METRO_GAUSSIAN:
-    case METRO_CAUCHY:
-    case METRO_VON_MISES: h = -1; break;
+    case METRO_VON_MISES: return metroi_mean_near(mean, k / 3, at);
+    case METRO_CAUCHY: return metroi_mean_near(mean, k, at);
+    case METRO_KELEMEN: return metroi_mean_kelemen_tail(mean, spectrum->period, k);
+    case METRO_TRIANGLE: fall = 2; break;
+    case METRO_UNIFORM: break;
     }
-    if (h < 0 || (h > 0 && k * h < 1)) {
-        near = log(kernel->shape == METRO_CAUCHY ? k : k / 3);
-        near += 2 * (mean->burn * at - log(-mean->keep * expm1(at)));
+    h /= fall; /* the triangle is two uniform steps of half the width */
+    if (k * h < 1) {
+        near = metroi_mean_near(mean, k / 3, at);
+        k = 1 / h;
     }
-    if (h < 0) return near; /* eq 5.42 */
-    if (k * h < 1 && h > 0) k = 1 / h;
-    if (h == 0 && (x = 4 * metroi_kelemen_bound(kernel) * spectrum->period) > k) {
-        near = metroi_kelemen_ceiling(kernel, k / spectrum->period);
-        near = near < 0 ? log(x) + 2 * (mean->burn * near - log(-expm1(near))) : METROI_INFINITY;
-        k = x;
-    }
-    x = h > 0 ? 1 / (METROI_PI * k * h) : metroi_kelemen_bound(kernel) * spectrum->period / k;
-    if (kernel->shape == METRO_TRIANGLE) {
-        x *= x;
-        falls = 2 * power + 1;
-    }
-    if (!(x < 0.5)) return METROI_INFINITY;
-    far = (power + 1) * log(x) + log(k / falls); /* eq 5.43 */
-    far += log((mean->last + 2) / (1 - x) + x / ((1 - x) * (1 - x)));
-    return log(2) + (near > far ? near : far);
+    x = 1 / (METROI_PI * k * h);
+    return log(2) + fmax(near, metroi_mean_far(mean, k, fall > 1 ? x * x : x, fall));
 }
 
 /* The series of eq 5.41 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
-   reach counts the steps whose weight (1 - p)^s is above e^{-45} only. */
+   reach counts only the steps whose weight (1 - p)^{s-2b} is above e^{-45}. */
 
 static metroi_scaled metroi_mean_modes(const metroi_mean *mean, double taken)
 {
     metroi_spectrum spectrum;
     metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY);
-    double longest = 2 * (mean->steps - 1), fade = -45 / log(mean->keep), reach, zero = 0, at, r, v, k;
+    double longest = 2 * (mean->steps - 1), reach, zero = 0, at, r, v, k;
     double total, rest, tolerance;
     int sign;
-    if (mean->keep < 1 && fade < longest) longest = fade;
+    if (mean->log_keep * longest < -45) longest = -45 / mean->log_keep;
     reach = metroi_reach(mean->kernel, 2 * mean->burn + longest);
     metroi_spectrum_make(mean->kernel, reach < 1 ? reach : 1, &spectrum);
     if (reach < 1) {
@@ -3909,7 +3953,6 @@ static metroi_scaled metroi_mean_modes(const metroi_mean *mean, double taken)
         total = metroi_scaled_log(sum);
         rest = metroi_mean_tail(mean, &spectrum, k, at);
         if (rest <= tolerance + (total > taken ? total : taken)) break;
-        if (at == -METROI_INFINITY && mean->kernel->shape == METRO_VON_MISES) break;
     }
     sum.factor *= 2;
     if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.41 */
@@ -3929,7 +3972,7 @@ static double metroi_cauchy_power(const metroi_mean *mean, double i, int falling
 {
     double rate = 2 * METROI_PI * mean->kernel->size;
     double c = falling ? 2 * mean->steps - 1 - i : i + 1;
-    return c * 2 / expm1(rate * (2 * mean->burn + i)) * (mean->keep < 1 ? pow(mean->keep, i) : 1);
+    return c * 2 / expm1(rate * (2 * mean->burn + i)) * exp(i * mean->log_keep);
 }
 
 static double metroi_cauchy_slope(const metroi_mean *mean, double from, double to, int falling)
@@ -3954,12 +3997,12 @@ static double metroi_cauchy_slope(const metroi_mean *mean, double from, double t
 
 static metroi_scaled metroi_mean_cauchy(const metroi_mean *mean)
 {
-    double rate = 2 * METROI_PI * mean->kernel->size, end = ceil(45 / (rate - log(mean->keep)));
+    double rate = 2 * METROI_PI * mean->kernel->size, end = ceil(45 / (rate - mean->log_keep));
     double top = mean->steps, sum;
     sum = metroi_cauchy_slope(mean, 0, end < top ? end : top, 0);
     if (end > 2 * top - 1) end = 2 * top - 1;
     if (end > top) sum += metroi_cauchy_slope(mean, top, end, 1);
-    return metroi_scaled_make(sum, 2 * mean->burn * log(mean->keep));
+    return metroi_scaled_make(sum, 2 * mean->burn * mean->log_keep);
 }
 
 /* M^2 E^2. Close to a whole number of turns the powers of d/Delta fall so fast that they are all we need; the Cauchy
@@ -3983,10 +4026,10 @@ static metroi_scaled metroi_mean_sum(metroi_mean *mean)
     mean->last = highest >= 2 * mean->burn ? highest - 2 * mean->burn : -1;
     sum = metroi_mean_powers(mean, mean->last, 1);
     if (mean->last >= 2 * (mean->steps - 1)) return sum;
-    sum.log -= 2 * mean->burn * log(mean->keep);
+    sum.log -= 2 * mean->burn * mean->log_keep;
     modes = metroi_mean_modes(mean, metroi_scaled_log(sum));
     metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.40 */
-    sum.log += 2 * mean->burn * log(mean->keep);
+    sum.log += 2 * mean->burn * mean->log_keep;
     return sum;
 }
 
@@ -4000,7 +4043,9 @@ static metroi_scaled metroi_mean_square(const metro_kernel *k, uint64_t burn, ui
     mean.kernel = k;
     mean.burn = (double)burn;
     mean.steps = (double)steps;
+    mean.large = k->large;
     mean.keep = 1 - k->large;
+    mean.log_keep = log1p(-k->large);
     mean.odd_steps = (int)(steps & 1);
     mean.last = -1;
     square = metroi_mean_sum(&mean);
@@ -4054,7 +4099,7 @@ METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double
 
        TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.45)
 
-   Both are bounded by the L2 error, by the inequalities of Cauchy and Schwarz and of Jensen:
+   The L2 error bounds both distances of eq 5.45, by the inequalities of Cauchy and Schwarz and of Jensen:
 
        TV <= min(1, E_n/2)                                                            (5.46)
        KL <= ln(1 + E_n^2)                                                            (5.47)
@@ -4753,6 +4798,8 @@ METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t b
    opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples, where Delta
    = .1 has 121 times it. Every other importance than the constant one pulls the best size down (chapter 6).
 
+   [figure: size.svg | Mean squared error, squared bias and variance against the size of the perturbation.]
+
    As a function of the size the mean squared error has many minima, one for each lobe of each mode. We scan it on 749
    sizes, in sixteenths of an octave up to 1/4 and in steps of 1/80 from there to 8, and refine the three best of the
    scan's minima by golden section (Kiefer 1953). A minimum is known to about 1e-8 of its place, as flat as it is. */
@@ -5084,7 +5131,8 @@ METRO_API void metro_operator_free(metro_operator *op)
    $1/4 + (3/4) 3^{-n}$, after a start in the bright one with $1/4 - (1/4) 3^{-n}$: what a seed leaves behind shrinks
    to a third in each step, whichever seed it was, and the dim one leaves three times as much.
 
-   All of the arithmetic is in these three functions. Four terms at a time keep the adders of a processor busy. */
+   All of the arithmetic is in these three functions. Four terms at a time keep the adders of a processor busy, and
+   small sizes have many zeros to skip. */
 
 static void metroi_matrix_add_product(const double *a, const double *b, size_t n, double *out)
 {
@@ -5094,6 +5142,7 @@ static void metroi_matrix_add_product(const double *a, const double *b, size_t n
         for (k = 0; k + 4 <= n; k += 4) {
             const double *factor = a + i * n + k, *b0 = b + k * n, *b1 = b0 + n, *b2 = b1 + n, *b3 = b2 + n;
             double f0 = factor[0], f1 = factor[1], f2 = factor[2], f3 = factor[3];
+            if (f0 == 0 && f1 == 0 && f2 == 0 && f3 == 0) continue;
             for (j = 0; j < n; j++) to[j] += (f0 * b0[j] + f1 * b1[j]) + (f2 * b2[j] + f3 * b3[j]);
         }
         for (; k < n; k++)
@@ -5198,18 +5247,7 @@ METRO_API metro_result metro_operator_evolve(const metro_operator *op, uint64_t 
 
    The total variation TV is the largest error in the probability of any set whatever. The second form of the
    divergence adds only positive terms; the first one loses everything to cancellation when p is near pi. For small u
-   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$. */
-
-static double metroi_cell_divergence(double u)
-{
-    double sum = 0, power = u, k;
-    if (fabs(u) > 0.1) return u > -1.0 ? (1.0 + u) * log1p(u) - u : 1.0;
-    for (k = 2; k <= 18; k++) {
-        power *= -u;
-        sum -= power / (k * (k - 1));
-    }
-    return sum;
-}
+   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$, the phi of eq 5.49. */
 
 METRO_API metro_distance metro_operator_distance(const metro_operator *op, const double *mass)
 {
@@ -5225,7 +5263,7 @@ METRO_API metro_distance metro_operator_distance(const metro_operator *op, const
         metro_sum_add(&variation, fabs(off)); /* eq 6.9 */
         if (dark && !(mass[i] > 0)) continue;
         metro_sum_add(&chi, dark ? METROI_INFINITY : off / pi * off); /* eq 6.8 */
-        metro_sum_add(&divergence, dark ? METROI_INFINITY : pi * metroi_cell_divergence(off / pi)); /* eq 6.10 */
+        metro_sum_add(&divergence, dark ? METROI_INFINITY : pi * metroi_divergence_phi(off / pi)); /* eq 6.10 */
     }
     if (!(fabs(metro_sum_value(&total) - 1.0) <= 1e-9)) return distance;
     distance.l2 = sqrt((double)op->cells * metro_sum_value(&square));
@@ -5582,14 +5620,16 @@ static int metroi_run_settled(const metroi_run *run, const double *stationary)
 
        frac{pi(V_M)}{M} >= frac{pi(V_a)}{a} - pi(g^2)                                                        (6.21) */
 
-static double metroi_run_cost(const metroi_run *run, const double *stationary, double samples)
+static double metroi_run_cost(const metroi_run *run, const double *seeds, double samples)
 {
-    return metroi_matrix_dot(stationary, run->square, run->n) / samples;
+    return metroi_matrix_dot(seeds, run->square, run->n) / samples;
 }
 
-/* U and V of the whole run in `sum` and `square`, which arrive zeroed. Returns 0 if it was given up. */
-static int metroi_run_steps(metroi_run *run, const double *stationary, uint64_t steps, double enough, double *sum,
-                            double *square)
+/* U and V of the whole run in `sum` and `square`, which arrive zeroed. Returns 0 if it was given up: with `seeds`,
+   the probability of each seed, when a sample costs more than `enough` both from them and, for sure, in
+   equilibrium. */
+static int metroi_run_steps(metroi_run *run, const double *stationary, uint64_t steps, const double *seeds,
+                            double enough, double *sum, double *square)
 {
     int settled = metroi_run_settled(run, stationary);
     double samples = 1.0, spread = metroi_run_cost(run, stationary, 1.0);
@@ -5601,7 +5641,9 @@ static int metroi_run_steps(metroi_run *run, const double *stationary, uint64_t 
         metroi_run_double(run);
         steps /= 2;
         samples *= 2.0;
-        if (metroi_run_cost(run, stationary, samples) - spread > enough) return 0; /* eq 6.21 */
+        if (seeds != NULL && metroi_run_cost(run, seeds, samples) > enough &&
+            metroi_run_cost(run, stationary, samples) - spread > enough) /* eq 6.21 */
+            return 0;
         settled = metroi_run_settled(run, stationary);
     }
     for (; done < steps && !(settled && done == 2); done++) {
@@ -5631,7 +5673,8 @@ static metro_operator_error metroi_run_mean(const metro_operator *op, const doub
 
 /* Everything but the checks; a run that was given up has infinite means. */
 static metro_result metroi_run_compute(const metro_operator *op, const double *f, uint64_t burn, uint64_t steps,
-                                       double enough, double *bias, double *mse, metro_operator_error *mean)
+                                       const double *seeds, double enough, double *bias, double *mse,
+                                       metro_operator_error *mean)
 {
     metroi_run run;
     size_t n = op->cells, i;
@@ -5641,7 +5684,7 @@ static metro_result metroi_run_compute(const metro_operator *op, const double *f
     metroi_run_begin(&run, op, f, memory);
     sum = run.step[2] + n;
     square = sum + n;
-    if (!metroi_run_steps(&run, op->stationary, steps, enough, sum, square)) {
+    if (!metroi_run_steps(&run, op->stationary, steps, seeds, enough, sum, square)) {
         for (i = 0; i < n; i++) sum[i] = square[i] = METROI_INFINITY;
     } else if (burn > 0) result = metroi_operator_advance(op, burn, sum, 2);
     if (result == METRO_OK && mean != NULL) *mean = metroi_run_mean(op, sum, square, m);
@@ -5661,7 +5704,7 @@ METRO_API metro_result metro_operator_run(const metro_operator *op, const double
     for (i = 0; i < op->cells; i++)
         if (!isfinite(f[i])) return METRO_ERROR_ARGUMENT;
     if (steps == 0) return METRO_ERROR_ARGUMENT;
-    return metroi_run_compute(op, f, burn, steps, METROI_INFINITY, bias, mse, mean);
+    return metroi_run_compute(op, f, burn, steps, NULL, 0, bias, mse, mean);
 }
 
 /* # 6.6 The exponential
@@ -5769,6 +5812,9 @@ METRO_API double metro_exponential_best_size(double lambda, int reflecting)
    so this is the mean of M samples after a burn-in of one step, $V = P V_M$ in the terms of section 6.5. Its mean
    squared error is
 
+   [figure: operator.svg | Five importances: the exact error against the size of the perturbation, and the sizes that
+   three rules choose.]
+
        E_M^2(Delta) = "bias"^2 + "variance" = frac{1}{N} sum_{i} frac{V(i)}{M^2}                             (6.26)
 
    averaged over seeds drawn uniformly, or taken at the seed that the program will use. Sections 6.1 and 6.5 compute
@@ -5812,6 +5858,7 @@ enum { METROI_PILOT_POINTS = 64 };
 
 typedef struct {
     double importance[METROI_PILOT_POINTS], integrand[METROI_PILOT_POINTS];
+    double seeds[METROI_PILOT_POINTS]; /* the probability of each cell to be the seed's */
     size_t start;  /* the cell of the seed, or METROI_PILOT_POINTS for the mean over seeds */
     size_t refused;
     uint64_t steps;
@@ -5840,7 +5887,7 @@ static metro_result metroi_pilot_survey(metroi_pilot *pilot, const metro_best_op
 {
     metro_rng rng = metro_rng_make(options->seed, 0);
     metro_result result = METRO_OK;
-    double n = METROI_PILOT_POINTS;
+    double n = METROI_PILOT_POINTS, lit = 0;
     size_t cell;
     pilot->start = METROI_PILOT_POINTS;
     if (options->start != NULL) {
@@ -5851,6 +5898,11 @@ static metro_result metroi_pilot_survey(metroi_pilot *pilot, const metro_best_op
         double x = ((double)cell + metro_rng_uniform(&rng)) / n;
         if (cell == pilot->start) x = *options->start;
         result = metroi_pilot_point(pilot, cell, x, importance, options->integrand, user);
+        if (pilot->importance[cell] > 0) lit++;
+    }
+    for (cell = 0; cell < METROI_PILOT_POINTS; cell++) {
+        if (pilot->start < METROI_PILOT_POINTS) pilot->seeds[cell] = cell == pilot->start;
+        else pilot->seeds[cell] = pilot->importance[cell] > 0 ? 1.0 / lit : 0;
     }
     return result;
 }
@@ -5864,13 +5916,13 @@ static metro_result metroi_pilot_try(const metroi_pilot *pilot, double size, met
     metro_operator_error mean;
     metro_result result;
     double enough = 4.0 * (double)pilot->steps * (best->bias2 + best->variance);
-    if (pilot->start < METROI_PILOT_POINTS) enough = METROI_INFINITY;
     kernel.shape = METRO_UNIFORM;
     kernel.size = size;
     kernel.size_min = kernel.large = 0;
     result = metro_operator_make(&kernel, pilot->importance, METROI_PILOT_POINTS, &op);
     if (result != METRO_OK) return result;
-    result = metroi_run_compute(&op, pilot->integrand, 1, pilot->steps, enough, bias, mse, &mean);
+    result = metroi_run_compute(&op, pilot->integrand, 1, pilot->steps, pilot->seeds, enough, bias, mse,
+                                &mean);
     if (result == METRO_OK && pilot->start < METROI_PILOT_POINTS) {
         mean.bias2 = bias[pilot->start] * bias[pilot->start];
         mean.mse = mse[pilot->start];
@@ -5893,10 +5945,10 @@ static metro_result metroi_pilot_try(const metroi_pilot *pilot, double size, met
    halving then close in on the best one. Sizes are tried from the largest to the smallest, so that among equals, as
    when f is constant, the largest wins.
 
-   A size is given up (eq 6.21) when a sample costs four times what it costs with the best size so far. The bound
-   holds in equilibrium, and the seed is not drawn from it: from uniform seeds a chain that never moves can be luckier
-   than that, in 64 cells by a factor of about sqrt(64)/2 = 4. A given seed may be luckier still, and there nothing is
-   given up. */
+   A size is given up when a sample costs four times what it costs with the best size so far, from the seeds and in
+   equilibrium. Equilibrium alone makes it final (eq 6.21), but seeds that start where f happens to have its mean may
+   be luckier than equilibrium for long; and the cost from the seeds alone may be that of a slow start, which a long
+   run forgets. */
 
 static metro_result metroi_pilot_search(const metroi_pilot *pilot, metro_best *found)
 {
@@ -7686,6 +7738,8 @@ METRO_API metro_result metro_image_save_ppm(const metro_image *image, const char
    Two numbers, because each hides something. The relative root mean square error compares energies: a lamp in the
    picture decides it alone.
 
+   [figure: picture_sheet.svg | What a chain has seen of a picture after more and more mutations.]
+
        epsilon = sqrt{frac{sum (I - R)^2}{sum R^2}}                                   (8.4)
 
    relMSE weighs each pixel by its own brightness, as the eye does. With $X$ the luminance of the picture and $Y$ that
@@ -7777,6 +7831,10 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
     return METRO_OK;
 }
 
+#ifdef METROI_COMPILE_FAST
+#pragma GCC pop_options
+#undef METROI_COMPILE_FAST
+#endif
 #undef METROI_PI
 #undef METROI_NAN
 #undef METROI_INFINITY

@@ -1423,7 +1423,8 @@ static int cells_match(span a, span b)
 {
     int number_a, number_b;
     double x = span_value(a, &number_a), y = span_value(b, &number_b);
-    if (number_a && number_b) return x == y || (x - y) * (x - y) <= 1e-18 * y * y;
+    double off = (x - y) * (x - y), bound = 1e-18 * y * y; /* infinite or NaN: equal only to itself */
+    if (number_a && number_b) return x == y || (off <= bound && bound < 1e300);
     return span_equal(a, b);
 }
 

@@ -139,6 +139,7 @@ static int ask(const experiment *e, size_t draws, const metro_balance *balance, 
 {
     const char *trouble = metro_draws_trouble(e->draw, CHAINS, draws);
     double n = (double)(CHAINS * draws), ess = metro_ess(e->draw, CHAINS, draws);
+    printf("a state has 2 coordinates: x and y, where on the ridge; every one of them is moved by each proposal\n");
     printf("detailed balance: chi-square %.0f of %.0f, probability %.2g: %s\n", balance->chi_square, balance->freedom,
            balance->probability, balance->probability < 1e-6 ? "WRONG, check the ratio" : "nothing wrong is seen");
     printf("acceptance %.2f, longest stay %d, bad importances %d\n", (double)counts->accepted / (double)counts->steps,

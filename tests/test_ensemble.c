@@ -231,7 +231,7 @@ static double truth_of(const metro_axis *axes, size_t count, const double *seed,
     return sum;
 }
 
-/* Catches: a wrong spectrum or a wrong chain, bins, a bias of the squared modulus (J groups and eq 7.32 remove it). */
+/* Catches: a wrong spectrum or a wrong chain, bins, a bias of the squared modulus (J groups and eq 7.17 remove it). */
 static void expect_theory(const metro_axis *axes, size_t count, const double *seed, const double *alpha, size_t seeds,
                           int K, double large, double chains, int agree)
 {

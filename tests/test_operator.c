@@ -1058,7 +1058,7 @@ static void chosen_sizes_are_efficient(void)
                 printf("%-6s M %5d  efficiency %.3f, worst %.3f\n", row[k].name, (int)steps[m], mean, worst);
             CHECK(mean >= 0.98, "%s, M = %d: efficiency %g", row[k].name, (int)steps[m], mean);
             CHECK(worst >= 0.95, "%s, M = %d: worst efficiency %g", row[k].name, (int)steps[m], worst);
-            CHECK(mean <= 1.001, "%s, M = %d: %g is better than the best", row[k].name, (int)steps[m], mean);
+            CHECK(mean <= 1.005, "%s, M = %d: %g is better than the best", row[k].name, (int)steps[m], mean);
         }
 }
 
@@ -1087,8 +1087,8 @@ static double witness_integrand(double x, void *user)
 }
 
 /* Islands for all M to 2^63, uniform seeds and a given one: no size on the list has less error, by the public
-   functions at the points where the importance was asked, and they say of the chosen size what was predicted. Catches:
-   a good size given up early, points not one a cell, the seed ignored, or counted as a sample. */
+   functions at the points where the importance was asked, and they say of the chosen size what was predicted.
+   Catches: a good size given up early, points not one a cell, the seed ignored, or counted as a sample. */
 static void no_listed_size_is_better(void)
 {
     static const double sizes[] = { 0.03, 0.1, 0.15, 0.22, 0.46, 0.8, 1, 1.2, 1.4, 1.6, 2 };

@@ -336,7 +336,7 @@ static void moments(void)
 
 /* ---- Sobol points ---- */
 
-/* The rows of Joe and Kuo's list as published (degree, polynomial, first integers), continued by eq 2.11 in another
+/* The rows of Joe and Kuo's list as published (degree, polynomial, first integers), continued by eq 2.3 in another
    form than the table's. Catches: a number of the table mistyped, a shift off by one, digits from the wrong end. */
 static void sobol_table(void)
 {
