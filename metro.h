@@ -1,5 +1,6 @@
-/* metro.h - Metropolis sampling and its start-up bias, in one C header. Version 0.1.0. License MIT-0 (at the end of
-   the file).
+/* metro.h - Metropolis sampling and its start-up bias, in one C header.
+
+   Version 0.1.0. License: MIT-0 (at the end of the file).
 
    A Markov chain starts somewhere, and for a while its samples tell of that place. How long? How far off is a picture
    made of such samples, and how much of what is wrong with it is the start, how much the noise of samples that follow
@@ -2882,9 +2883,6 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
 
    A density on the circle of length 1 is the sum of its harmonics,
 
-   [figure: fig1.svg | The density after n steps: exact curves over histograms of an ensemble (figure 1 of the
-   paper).]
-
        p_n(x) = sum_{k=-inf}^{inf} a_k^{(n)} e^{2 pi i k x}
        a_k^{(n)} = int_{0}^{1} p_n(x) e^{-2 pi i k x} dx                              (5.3)
 
@@ -2922,6 +2920,9 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
    which we call the excess: for s = 2n and x = 0, or for several s and x. Small sizes and few steps make its series
    slow and the density easy; large sizes and many steps make the density flat and the series fast. We write it both
    ways, and choose.
+
+   [figure: fig1.svg | The density after n steps: exact curves over histograms of an ensemble (figure 1 of the
+   paper).]
 
    # 5.3 Numbers that outlive the double
 
@@ -3109,9 +3110,6 @@ static double metroi_spectrum_tail(const metroi_spectrum *spectrum, double s, do
 
    One loop serves them all:
 
-   [figure: accuracy.svg | What accuracy costs: error against time for the series and the library, the operator, an
-   ensemble, and the size of the perturbation.]
-
        S = sum_{k=1}^{inf} P(k/T)^s w_k, w_k = cos(2 pi k x/T) "or" abs(A_k)^2        (5.13)
 
    The weights are those of a point x, or those of a set of seeds (section 5.11). Beside S we keep S', the same sum of
@@ -3121,7 +3119,10 @@ static double metroi_spectrum_tail(const metroi_spectrum *spectrum, double s, do
    than terms; after the first 16 terms we look at every eighth.
 
    For Kelemen's kernel at small s the terms fall slowly. After 50000 of them it has to be content with 1e-9, and
-   where ten times as many do not give that the answer is NaN. */
+   where ten times as many do not give that the answer is NaN.
+
+   [figure: accuracy.svg | What accuracy costs: error against time for the series and the library, the operator, an
+   ensemble, and the size of the perturbation.] */
 
 #define METROI_PATIENCE 5e4
 
@@ -3217,9 +3218,6 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
 
    The tentative sample is uniform in an interval of width Delta around the current one,
 
-   [figure: fig2.svg | The start-up error against the number of steps for perturbations of different width, with
-   estimates from ensembles of chains (figure 2 of the paper).]
-
        P(x - y) = 1/Delta "for" abs(x - y) < Delta/2, "else" 0                        (5.16)
 
    Paper (16) prints abs(x - y) < Delta, and that integrates to 2. Its transform, paper (17), is right, for Delta > 1
@@ -3257,7 +3255,10 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
 
    With eq 5.8 the first errors are E_1^2 = (1 - g)/g and E_2^2 = (2 - 3 g)/(3 g). Splines serve for s <= 10, and on
    to 24 as long as the chain has not gone around the circle; then 1 does not cancel from p_s. Beyond, the modes decay
-   fast and eq 5.13 or eq 5.14 takes over. */
+   fast and eq 5.13 or eq 5.14 takes over.
+
+   [figure: fig2.svg | The start-up error against the number of steps for perturbations of different width, with
+   estimates from ensembles of chains (figure 2 of the paper).] */
 
 #define METROI_SPLINE_ORDER 24
 
@@ -3527,8 +3528,6 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
    One way to reduce the start-up error is to start at one of several seeds x_i, chosen with the probability alpha_i,
    paper (13):
 
-   [figure: seeds.svg | The corrected formula for several seeds, the printed one, and what chains do.]
-
        p_0(x) = sum_{i=1}^{N} alpha_i delta(x - x_i), sum_{i=1}^{N} alpha_i = 1       (5.28)
 
    The coefficients of p_0 are
@@ -3550,7 +3549,9 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
 
    N seeds at equal distances with equal weights leave only the multiples of N: all other A_k vanish. More a set of
    seeds cannot do. It starts the chain better; it makes it forget no faster. To see such zeros the sums over seeds
-   must reduce k x_i exactly (eq 3.2): 1e-16 that is left of A_1 survives where P*(N)^n does not. */
+   must reduce k x_i exactly (eq 3.2): 1e-16 that is left of A_1 survives where P*(N)^n does not.
+
+   [figure: seeds.svg | The corrected formula for several seeds, the printed one, and what chains do.] */
 
 static double metroi_seed_weight(const metroi_seeds *seeds, size_t i)
 {
@@ -3747,8 +3748,6 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
    much. If a step perturbs all d coordinates at once and independently, the density of the state is the product of
    those of its coordinates, and with e_j the start-up error of coordinate j
 
-   [figure: fig2_dimensions.svg | The start-up error in one, two, three and five dimensions.]
-
        1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.35)
 
    While the e_j are large, the error grows like their product; when they are small, only like sqrt(d). We evaluate eq
@@ -3759,7 +3758,9 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
    A step that perturbs only one coordinate, picked at random, is another matter. Its eigenvalues are 1 - (1/d) sum_j
    (1 - P*(k_j)), and with probability (1 - 1/d)^n a given coordinate has not been touched after n steps: p_n keeps a
    part that is concentrated on a line, and for d >= 2 its L2 error is infinite for every n. Taking the coordinates in
-   turn makes it finite after a full sweep. The library computes neither. */
+   turn makes it finite after a full sweep. The library computes neither.
+
+   [figure: fig2_dimensions.svg | The start-up error in one, two, three and five dimensions.] */
 
 static metroi_scaled metroi_axes_square(const metro_kernel *k, size_t axes, uint64_t n)
 {
@@ -5812,9 +5813,6 @@ METRO_API double metro_exponential_best_size(double lambda, int reflecting)
    so this is the mean of M samples after a burn-in of one step, $V = P V_M$ in the terms of section 6.5. Its mean
    squared error is
 
-   [figure: operator.svg | Five importances: the exact error against the size of the perturbation, and the sizes that
-   three rules choose.]
-
        E_M^2(Delta) = "bias"^2 + "variance" = frac{1}{N} sum_{i} frac{V(i)}{M^2}                             (6.26)
 
    averaged over seeds drawn uniformly, or taken at the seed that the program will use. Sections 6.1 and 6.5 compute
@@ -5852,7 +5850,10 @@ METRO_API double metro_exponential_best_size(double lambda, int reflecting)
    The points are drawn at random so that no feature hides between points of a grid for ever; the integrand is asked
    only where the importance is positive, as the chain would. A value that is negative, infinite or NaN counts as
    dark, because the chain will reject such states, and is reported. A given seed takes the place of the point in its
-   cell. */
+   cell.
+
+   [figure: operator.svg | Five importances: the exact error against the size of the perturbation, and the sizes that
+   three rules choose.] */
 
 enum { METROI_PILOT_POINTS = 64 };
 

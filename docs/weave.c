@@ -2115,8 +2115,9 @@ static void example_keep(weave *w, const text *code, size_t line)
 {
     text program = { NULL, 0, 0 };
     char name[64];
-    if (w->extract == NULL || w->collecting || span_find(span_of_text(code), "#include \"metro.h\"") == code->size)
-        return;
+    if (w->extract == NULL || w->collecting) return;
+    if (span_find(span_of_text(code), "#include \"metro.h\"") == code->size) return;
+    if (span_find(span_of_text(code), "int main(") == code->size) return;
     snprintf(name, sizeof name, "example_%lu.c", (unsigned long)++w->examples);
     text_format(&program, "#line %lu \"%s\"\n", (unsigned long)line, w->writing->from.path);
     text_put_span(&program, span_of_text(code));

@@ -13,7 +13,7 @@ strict="-Wall -Wextra -pedantic -Wconversion -Wshadow -Wdouble-promotion -Wcast-
 strict_c="$strict -Wstrict-prototypes -Wmissing-prototypes"
 # Of clang's -Weverything these say nothing of use here: comparisons of doubles with 0 are meant, padding is layout, C++98
 # and C90 are not targets, and a header with contracts in prose declares what it does not use.
-everything="-Weverything -Wno-float-equal -Wno-padded -Wno-declaration-after-statement -Wno-unused-function
+everything="-Weverything -Wno-unknown-warning-option -Wno-float-equal -Wno-padded -Wno-declaration-after-statement -Wno-unused-function
  -Wno-unused-macros -Wno-disabled-macro-expansion -Wno-covered-switch-default -Wno-switch-enum -Wno-reserved-identifier
  -Wno-reserved-id-macro -Wno-cast-align -Wno-c++98-compat -Wno-c++98-compat-pedantic -Wno-old-style-cast
  -Wno-zero-as-null-pointer-constant -Wno-unsafe-buffer-usage -Wno-documentation -Wno-poison-system-directories"

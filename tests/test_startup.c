@@ -291,6 +291,18 @@ static double bessel_i0(double x)
     return sum;
 }
 
+/* sqrt(2 pi x) e^{-x} I_0(x) for large x, by its asymptotic series */
+static double bessel_i0_large(double x)
+{
+    double sum = 1, term = 1;
+    int m;
+    for (m = 1; m < 12; m++) {
+        term *= (2 * m - 1) * (2 * m - 1) / (8 * m * x);
+        sum += term;
+    }
+    return sum;
+}
+
 /* Catches: a wrong first error of any shape, independently of the tables' parameters; failures: n = 1 with small Delta. */
 static void first_errors_are_closed(void)
 {
@@ -305,6 +317,11 @@ static void first_errors_are_closed(void)
     }
     k = kernel_make(METRO_VON_MISES, 7, 0, 0);
     CHECK_NEAR(metro_startup_error(&k, 1), sqrt(bessel_i0(14) / (bessel_i0(7) * bessel_i0(7)) - 1), 1e-12);
+    for (size = 600; size < 1e12; size *= 1.6) {
+        k = kernel_make(METRO_VON_MISES, size, 0, 0);
+        CHECK_NEAR(metro_startup_error(&k, 1),
+                   sqrt(sqrt(pi * size) * bessel_i0_large(2 * size) / pow(bessel_i0_large(size), 2) - 1), 1e-12);
+    }
     k = kernel_make(METRO_KELEMEN, s2, s1, 0);
     CHECK_NEAR(metro_startup_error(&k, 1), sqrt((s2 - s1) / (2 * l * l * s1 * s2) - 1), 1e-12);
     k = kernel_make(METRO_CAUCHY, 0.02, 0, 0);
@@ -550,7 +567,7 @@ static void density_moments(const metro_kernel *k, uint64_t n, const double *see
 }
 
 /* The density integrates to 1 and its L2 distance from 1 is the error: eqs 5.5, 5.6 and 5.7. Pieces of 1/40 put the kinks of
-   the uniform and the triangular kernel at their ends. Catches: a wrong sign or shift of odd powers beyond Delta = 1/2, a
+   the uniform and the triangular kernel at their ends. Catches: a
    seed's weight lost, images that are missing. */
 static void density_has_the_error(void)
 {
@@ -581,10 +598,12 @@ static void density_has_the_error(void)
 }
 
 /* p_{n+1}(x) = int p_n(x - u) P(u) du (eq 5.1) as the mean of p_n over a grid of steps drawn by inversion. Catches: a density of
-   the wrong n, a kernel of the wrong width, R of eq 5.25 with a wrong branch. */
+   the wrong n, a kernel of the wrong width, a wrong sign or shift of odd powers beyond Delta = 1/2, R of eq 5.25 with a wrong
+   branch. */
 static void density_is_a_convolution(void)
 {
     static const metro_shape shape[3] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_KELEMEN };
+    static const double scale[5] = { 1, 2.1, 2.9, 4.5, 8.6 };
     int s, n, i, j;
     for (s = 0; s < 3; s++)
         for (n = 2; n <= 6; n++)
@@ -593,6 +612,7 @@ static void density_is_a_convolution(void)
                 double x = 0.17 * i, seed = 0.31, sum = 0, u = 0, t;
                 int grid = s == 2 ? 400 : 2000;
                 if ((s == 2 && n > 3) || check_scale() < 1) continue;
+                if (s < 2) k.size *= scale[i];
                 for (j = 0; j < grid; j++) {
                     t = (j + 0.5) / grid;
                     if (s == 0) u = k.size * (t - 0.5);
@@ -703,6 +723,29 @@ static void long_means_agree_with_modes(void)
             }
 }
 
+/* Sums that keep every digit: Gaussian modes when M goes to infinity, M^2 E^2 = 2 sum 1/(e^{a k^2} - 1)^2, and Cauchy powers one
+   by one. Catches: 1 - P formed near 1, the correction of the Euler-Maclaurin panels left out or upside down. */
+static void long_means_keep_their_digits(void)
+{
+    static const double size[4] = { 1e-6, 1e-4, 1e-3, 0.01 };
+    static const int steps[4] = { 1025, 1500, 4000, 9000 };
+    int i, j, s;
+    for (i = 0; i < 4; i++) {
+        metro_kernel k = kernel_make(METRO_GAUSSIAN, size[i], 0, 0);
+        double sum = 0;
+        for (s = 30000; s >= 1; s--) sum += 2 / pow(expm1(2 * pow(pi * s * size[i], 2)), 2);
+        CHECK_NEAR(1e18 * metro_startup_error_mean(&k, 1, UINT64_C(1000000000000000000)), sqrt(sum), 1e-12);
+        for (j = 0; j < 4; j++) {
+            k = kernel_make(METRO_CAUCHY, size[i], 0, j % 2 == 0 ? 0 : 1e-4);
+            sum = 0;
+            for (s = 2 * steps[j]; s >= 2; s--)
+                sum += (s - 1 < 2 * steps[j] - s + 1 ? s - 1 : 2 * steps[j] - s + 1) * 2 / expm1(2 * pi * size[i] * s)
+                     * exp(s * log1p(-k.large));
+            CHECK_NEAR(steps[j] * metro_startup_error_mean(&k, 1, (uint64_t)steps[j]), sqrt(sum), 1e-12);
+        }
+    }
+}
+
 /* ---- The interval and d dimensions ---- */
 
 /* Eq 5.33 with chapter 3's eigenvalues, and what follows from symmetry. Catches: x0 folded wrongly, the size not halved, the
@@ -796,6 +839,12 @@ static void distances_bound_the_density(void)
         double f = k.size - 7;
         CHECK_NEAR(metro_startup_total_variation(&k, 1), f * (1 - f) / k.size, 1e-12);
         CHECK_NEAR(metro_startup_divergence(&k, 1), 0.5 * f * (1 - f) / (k.size * k.size), 0.06);
+    }
+    /* f = 1/2: KL = ((1+u) ln(1+u) + (1-u) ln(1-u))/2 with u = 1/(2 Delta), a short series */
+    for (p = 5.5; p < 1e7; p = 10 * p + 0.5) {
+        metro_kernel k = uniform(p);
+        double u = 0.25 / (p * p);
+        CHECK_NEAR(metro_startup_divergence(&k, 1), u * (1.0 / 2 + u * (1.0 / 12 + u * (1.0 / 30 + u * (1.0 / 56 + u / 90)))), 1e-12);
     }
 }
 
@@ -971,6 +1020,7 @@ int main(void)
     CHECK_RUN(density_at_the_edges);
     CHECK_RUN(mean_is_a_double_sum);
     CHECK_RUN(long_means_agree_with_modes);
+    CHECK_RUN(long_means_keep_their_digits);
     CHECK_RUN(interval_agrees_with_its_modes);
     CHECK_RUN(axes_multiply);
     CHECK_RUN(distances_bound_the_density);
