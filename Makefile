@@ -7,7 +7,7 @@
 #   make check      the tests again under every compiler, sanitizer, emulator and fuzzer that is installed
 #   make bench      speed, as ratios and times
 #   make calibrate  long statistical studies of the stated errors
-#   make references remakes the committed reference pictures and figures
+#   make references remakes the committed figures
 #   make install    copies metro.h to $(DESTDIR)$(PREFIX)/include
 
 CC ?= cc
@@ -33,6 +33,9 @@ build/test_%: tests/test_%.c tests/check.h metro.h examples/plot.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
 build/bench_%: tests/bench_%.c metro.h | build
+	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
+
+build/calibrate_%: tests/calibrate_%.c metro.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
 build/weave: docs/weave.c | build
@@ -64,6 +67,14 @@ check: $(TESTS) build/weave docs
 bench: build/bench_laboratory
 	@build/bench_laboratory
 	@sh tests/bench_compile.sh
+
+calibrate: build/calibrate_laboratory
+	@build/calibrate_laboratory
+
+references: build/fig2
+	@build/fig2
+	@mkdir -p docs/figures
+	cp out/fig2.svg docs/figures/
 
 install:
 	install -d $(DESTDIR)$(PREFIX)/include

@@ -871,11 +871,11 @@ typedef struct {
 
 /* Measures E_n^2, the squared L2 distance between p_n and the uniform density, over the harmonics up to K along each
    axis, from empirical Fourier coefficients (eq 7.17): no bins, no smoothing. squared[i] is an unbiased estimate
-   after steps[i] steps and may be negative where E_n is small; error[i] is its standard error (eq 7.18). Both have
-   `times` values. What lies beyond K is not in the sum: for a uniform perturbation and n = 1 it is about 2/(pi^2
-   Delta^2 K), for larger n far less. Returns the errors of the chain, METRO_ERROR_ARGUMENT also for an axis that is a
-   direction, for over 2^20 modes or fewer than 4 jobs; then the outputs are untouched. Costs chains * (last step +
-   times * axes * modes). */
+   after steps[i] steps and may be negative where E_n is small; error[i] is its standard error (eq 7.18), somewhat too
+   large where nothing of E_n is left. Both have `times` values. What lies beyond K is not in the sum: for a uniform
+   perturbation and n = 1 it is about 2/(pi^2 Delta^2 K), for larger n far less. Returns the errors of the chain,
+   METRO_ERROR_ARGUMENT also for an axis that is a direction, for over 2^20 modes or fewer than 4 jobs; then the
+   outputs are untouched. Costs chains * (last step + times * axes * modes). */
 METRO_API metro_result metro_ensemble_measure(const metro_ensemble *ensemble, double *squared, double *error);
 
 /* # R8 Pictures
@@ -7868,7 +7868,7 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    | paper (16) | eq 5.16 | the condition must be abs(x - y) < Delta/2; as printed the density integrates to 2 | `metro_kernel_density` |
    | paper (17) | eq 5.17 | right on the unit period, for Delta > 1 too | `metro_kernel_coefficient` |
    | paper (18) | eq 7.1 | the sum runs to M - 1 with weights 1 - k/M, holds in stationarity, and gives a standard deviation | `metro_bernstein` |
-   | paper (19) | chapter 1 | the transport by bundles of rays is not part of the chapters above | none |
+   | paper (19) | none | none: the transport of light by bundles of rays is not part of these chapters | none |
 
    The printed algorithm of section 1.1 has the transition probabilities of its quotient exchanged: eq 4.2. Section
    2.3 asks for many more mutations than 1/Delta; diffusion needs many more than 1/Delta^2: eq 5.18. The apex angle of

@@ -2560,6 +2560,7 @@ static void page_style(text *out)
         "text-align:center}figcaption{max-width:42rem;margin-top:.5rem;font-size:.92rem;color:var(--soft)}",
         ".table{overflow-x:auto;margin:1rem 0}table{border-collapse:collapse;font-size:.92rem;line-height:1.45}",
         "th,td{text-align:left;vertical-align:top;padding:.3rem 1rem .3rem 0;border-bottom:1px solid var(--rule)}",
+        "td:first-child{white-space:nowrap}",
         "th{color:var(--soft);font-weight:600}.contents{list-style:none;padding:0}.contents .sub{",
         "padding-left:1.5rem}.contents li{margin:.1rem 0}nav{position:sticky;top:0;z-index:2;",
         "background:var(--side);border-bottom:1px solid var(--rule);font-size:.9rem;line-height:1.35;",
