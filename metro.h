@@ -507,11 +507,12 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error);
    -INFINITY means that the error is exactly 0.
 
    Accuracy, unless said otherwise: relative 1e-12, or 1e-12 of the logarithm where that is larger. METRO_KELEMEN from
-   the third step on: the same while its sizes lie within some 1000 times of each other and `size_min` is above 1e-4;
-   beyond, 1e-9; and NaN where they lie so close together that millions of terms would not do. */
+   n = 3 on: that while C = (1/s1 + 1/s2)/(2 pi ln(s2/s1)) is below 200, else 1e-9, and NaN where half a million terms
+   would not give that, which is for C above some thousands: sizes that are tiny beside the circle or close to each
+   other. Lengths below 1e-100 give NaN, and METRO_KELEMEN of sizes above 10000 at n = 1. */
 
-/* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: under 10 microseconds for every n
-   and size (METRO_KELEMEN: up to 0.2 ms at n <= 2 and 30 ms at n = 3, falling fast from there). */
+/* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: 0.1 to 2 microseconds for every n
+   and size, METRO_VON_MISES 15 (METRO_KELEMEN: up to 0.6 ms at n = 2 and 20 ms at n = 3, falling fast from there). */
 METRO_API double metro_startup_error(const metro_kernel *k, uint64_t n);
 METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
 
@@ -520,7 +521,7 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
    NULL or `seeds` is 0, when a seed is not finite, when a weight is negative or not finite, and when the weights do
    not sum to 1 within 1e-9. Where seeds cancel modes (equispaced ones) the error is small against that of one seed,
    and is known to 1e-13 of the latter, to 1e-8 for n <= 2; the logarithm is -INFINITY when nothing is left. Cost: for
-   n >= 3 proportional to `seeds`, some 50 ns times a number of modes that is about 100/size at n = 3 and 2/size from
+   n >= 3 proportional to `seeds`, some 80 ns times a number of modes that is about 150/size at n = 3 and 1/size from
    n = 10 on; for n <= 2 (METRO_TRIANGLE: n = 1) and for seeds much farther apart than the chain has gone,
    proportional to seeds^2 but without the modes. */
 METRO_API double metro_startup_error_seeds(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha,
@@ -530,8 +531,8 @@ METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n
 
 /* The error of the running mean (p_burn + .. + p_{burn+steps-1})/steps, which is the density that a sample picked at
    random among `steps` samples after a burn-in has; one seed; eq 5.38. burn = 0 includes p_0: +INFINITY. steps = 0:
-   NaN. Cost: 5 to 50 microseconds while burn + steps <= 1000 (METRO_KELEMEN: some ms); for METRO_UNIFORM and
-   METRO_TRIANGLE it grows with the square root of `steps`, to 10 ms at most for sizes from 1e-6. */
+   NaN. Cost: at most 50 microseconds while burn + steps <= 1000 (METRO_KELEMEN: up to 25 ms); for tiny sizes it grows
+   with the square root of `steps`, to 20 ms at most for sizes from 1e-6. */
 METRO_API double metro_startup_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 
@@ -539,8 +540,8 @@ METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t bu
    paper (9) and (14). n = 0: +INFINITY at a seed of positive weight, 0 elsewhere. n = 1: metro_kernel_density, so at
    a jump the mean of both sides. NaN for the arguments that give NaN there, for an `x` that is not finite, and for
    METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density. The error is below 1e-13 of the
-   largest value of p_n. Cost: some microseconds a seed; METRO_KELEMEN: 0.2 ms at n = 3 and 4, up to 50 ms at n = 5,
-   less beyond. */
+   largest value of p_n (METRO_KELEMEN from n = 5 on: 1e-12 while C is below 50, else as above). Cost: 0.1 to 2
+   microseconds a seed, METRO_VON_MISES 12; METRO_KELEMEN: 0.2 ms at n = 3 and 4, 15 ms at n = 5, less beyond. */
 METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
                                        const double *alpha, size_t seeds);
 
@@ -3182,9 +3183,10 @@ static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, in
 
        r = g min(s/2, 1/2 + sqrt{8 s})                                                (5.15)
 
-   Kelemen's density is unbounded by comparison, 1/(2 L s1), and A = 72 pays for that. A Gaussian of standard
-   deviation sigma sqrt(s) is left at 9.5 of them. A von Mises density of concentration kappa is nearly one with sigma
-   = 1/(2 pi sqrt(kappa)), with slightly more in its tail; 10 will do. The Cauchy density has no reach. */
+   Kelemen's density is unbounded by comparison, 1/(2 L s1), and A = 72 pays for that. A Gaussian is left at 9 of its
+   standard deviations, sigma sqrt(s). A von Mises density of concentration 1000 or more is nearly one, with sigma =
+   1/(2 pi sqrt(kappa)); its tail is heavier by a hundredth of the exponent at most. The Cauchy density has no reach.
+   */
 
 static double metroi_reach(const metro_kernel *k, double s)
 {
@@ -3192,8 +3194,8 @@ static double metroi_reach(const metro_kernel *k, double s)
     switch (k->shape) {
     case METRO_UNIFORM: return c * (s < 34 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
     case METRO_TRIANGLE: return 0.5 * c * (s < 17 ? s : 0.5 + sqrt(16 * s));
-    case METRO_GAUSSIAN: return 9.5 * c * sqrt(s);
-    case METRO_VON_MISES: return c < METROI_SMOOTH_KAPPA ? METROI_INFINITY : 10 * sqrt(s / c) / (2 * METROI_PI);
+    case METRO_GAUSSIAN: return 9 * c * sqrt(s);
+    case METRO_VON_MISES: return c < METROI_SMOOTH_KAPPA ? METROI_INFINITY : 9 * sqrt(s / c) / (2 * METROI_PI);
     case METRO_KELEMEN: return c * (s < 146 ? s : 1 + 12 * sqrt(s));
     case METRO_CAUCHY: break;
     }

@@ -26,7 +26,8 @@ static metro_kernel uniform(double size)
 /* One kernel of each shape, of moderate size, with and without large steps. */
 static metro_kernel specimen(int i)
 {
-    static const metro_shape shape[6] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN, METRO_CAUCHY, METRO_VON_MISES, METRO_KELEMEN };
+    static const metro_shape shape[6] = { METRO_UNIFORM, METRO_TRIANGLE,  METRO_GAUSSIAN,
+                                          METRO_CAUCHY,  METRO_VON_MISES, METRO_KELEMEN };
     static const double size[6] = { 0.3, 0.5, 0.1, 0.05, 4, 0.4 };
     return kernel_make(shape[i % 6], size[i % 6], 0.05, i < 6 ? 0 : 0.2);
 }
@@ -63,8 +64,8 @@ static void single_row(char **field, int fields)
     check_error(metro_startup_error(&k, n), metro_startup_log_error(&k, n), field[2], field[3]);
 }
 
-/* Catches: Delta taken as the half width, a power n for 2n, a series cut too early, a wrong branch at n = 6, a logarithm
-   that underflows with its error. */
+/* Catches: Delta taken as the half width, a power n for 2n, a series cut too early, a wrong branch at n = 6, a
+   logarithm that underflows with its error. */
 static void table_uniform(void)
 {
     row_shape = METRO_UNIFORM;
@@ -145,6 +146,7 @@ static void seeds_row(char **field, int fields)
     size_t seeds = list_read(field[1], seed);
     metro_kernel k = uniform(number(field[3]));
     uint64_t n = strtoull(field[4], NULL, 10);
+    if (check_scale() < 1 && n == 3 && k.size < 0.1) return; /* ten thousand modes */
     CHECK(fields == 7 && list_read(field[2], alpha) == seeds, "%d fields", fields);
     error = metro_startup_error_seeds(&k, n, seed, alpha, seeds);
     logarithm = metro_startup_log_error_seeds(&k, n, seed, alpha, seeds);
@@ -153,8 +155,8 @@ static void seeds_row(char **field, int fields)
     else CHECK_CLOSE(error, truth, 1e-12 * truth + (n <= 2 ? 1e-8 : 1e-13) * single);
 }
 
-/* Catches: the seed sum inside the power (paper (15) as printed), weights squared or forgotten, e^{-2 pi i k x} with a
-   half turn. */
+/* Catches: the seed sum inside the power (paper (15) as printed), weights squared or forgotten, e^{-2 pi i k x} with
+   a half turn. */
 static void table_seeds(void)
 {
     CHECK(check_rows("multiseed_uniform.csv", seeds_row) == 168, "rows");
@@ -186,7 +188,8 @@ static void reflect_row(char **field, int fields)
     double x0 = number(field[1]);
     uint64_t n = strtoull(field[2], NULL, 10);
     CHECK(fields == 5, "%d fields", fields);
-    check_error(metro_reflect_startup_error(&k, x0, n), metro_reflect_startup_log_error(&k, x0, n), field[3], field[4]);
+    check_error(metro_reflect_startup_error(&k, x0, n), metro_reflect_startup_log_error(&k, x0, n), field[3],
+                field[4]);
 }
 
 /* Catches: the circle's spectrum on the interval, the seed halved with the kernel, cos^2 for its mean 1/2. */
@@ -200,7 +203,8 @@ static void mean_row(char **field, int fields)
     metro_kernel k = kernel_make(row_shape, number(field[0]), 0, 0);
     uint64_t burn = strtoull(field[1], NULL, 10), steps = strtoull(field[2], NULL, 10);
     CHECK(fields == 5, "%d fields", fields);
-    check_error(metro_startup_error_mean(&k, burn, steps), metro_startup_log_error_mean(&k, burn, steps), field[3], field[4]);
+    check_error(metro_startup_error_mean(&k, burn, steps), metro_startup_log_error_mean(&k, burn, steps), field[3],
+                field[4]);
 }
 
 /* Catches: a mean that starts at p_0 or p_{b+1}, 1 - P^M formed near 1, a power taken out twice. */
@@ -303,7 +307,8 @@ static double bessel_i0_large(double x)
     return sum;
 }
 
-/* Catches: a wrong first error of any shape, independently of the tables' parameters; failures: n = 1 with small Delta. */
+/* Catches: a wrong first error of any shape, independently of the tables' parameters; failures: n = 1 with small
+   Delta. */
 static void first_errors_are_closed(void)
 {
     double s1 = 0.013, s2 = 0.2, l = log(s2 / s1), size;
@@ -346,8 +351,8 @@ static double mode(const metro_kernel *k, int harmonic)
 }
 
 /* The series of eq 5.7 added from its far end, for every shape, n where it converges by 20000 terms, sizes on both
-   sides of 1. Catches: a sum that stops early or on the zero of a mode, a wrong period of eq 5.14, a size taken modulo 1
-   without its factor. */
+   sides of 1. Catches: a sum that stops early or on the zero of a mode, a wrong period of eq 5.14, a size taken
+   modulo 1 without its factor. */
 static void direct_sums_agree(void)
 {
     static const double scale[6] = { 0.11, 0.9, 1.6, 3.7, 8.15, 0.031 };
@@ -370,7 +375,8 @@ static void direct_sums_agree(void)
         }
 }
 
-/* E_n^2 is a moment sequence in n: log-convex and decreasing. Catches: a step where one algorithm hands over to the next. */
+/* E_n^2 is a moment sequence in n: log-convex and decreasing. Catches: a step where one algorithm hands over to the
+   next. */
 static void errors_are_log_convex(void)
 {
     int shape, n;
@@ -431,7 +437,8 @@ static void whole_sizes_are_exact(void)
 /* Failures: n = 1e6 and more. Catches: a logarithm that ends with its error, an overflow of 2n. */
 static void logarithms_outlive_the_double(void)
 {
-    static const uint64_t steps[5] = { 1000000, 1000000000, UINT64_C(1000000000000), UINT64_C(1000000000000000000), UINT64_MAX };
+    static const uint64_t steps[5] = { 1000000, 1000000000, UINT64_C(1000000000000), UINT64_C(1000000000000000000),
+                                       UINT64_MAX };
     int shape, i;
     for (shape = 0; shape < 12; shape++)
         for (i = 0; i < 5; i++) {
@@ -455,7 +462,7 @@ static void tiny_sizes_are_quick(void)
     for (size = 1e-20; size < 1e-4; size *= 57)
         for (n = 1e4; n < 0.1 / (size * size) && n < 1e18; n *= 97) {
             metro_kernel k = uniform(size), g = kernel_make(METRO_GAUSSIAN, size / sqrt(12.0), 0, 0);
-            /* central limit with its first correction, 1 - (3/20)/(2n) for uniform steps; the second is of order n^-2 */
+            /* central limit with its first correction, 1 - 3/(40 n) for uniform steps; the next is of order 1/n^2 */
             truth = sqrt(6 / (pi * 2 * n)) / size * (1 - 3 / (40 * n)) - 1;
             CHECK_NEAR(pow(metro_startup_error(&k, (uint64_t)n), 2), truth, 1e-8);
             CHECK_NEAR(pow(metro_startup_error(&g, (uint64_t)n), 2), sqrt(3 / (pi * n)) / size - 1, 1e-11);
@@ -466,8 +473,8 @@ static void tiny_sizes_are_quick(void)
 
 /* ---- Seeds ---- */
 
-/* N = 2^j equispaced seeds leave the multiples of N, and P*(k N) of size Delta is P*(k) of size N Delta. Failures: only
-   multiples of N survive. Catches: A_k with an inexact argument, a sum that stops before mode N. */
+/* N = 2^j equispaced seeds leave the multiples of N, and P*(k N) of size Delta is P*(k) of size N Delta. Failures:
+   only multiples of N survive. Catches: A_k with an inexact argument, a sum that stops before mode N. */
 static void equispaced_seeds_are_a_wider_kernel(void)
 {
     static const uint64_t steps[7] = { 1, 2, 3, 5, 20, 300, 100000 };
@@ -491,8 +498,9 @@ static void equispaced_seeds_are_a_wider_kernel(void)
         }
 }
 
-/* The same, but tiny seeds: the pairs of eq 5.32 against the series at the edge of their use, and rotation, whole turns,
-   doubled seeds. Catches: a seed that is not wrapped, a pair counted once, weights not squared on the diagonal. */
+/* The same, but tiny seeds: the pairs of eq 5.32 against the series at the edge of their use, and rotation, whole
+   turns, doubled seeds. Catches: a seed that is not wrapped, a pair counted once, weights not squared on the
+   diagonal. */
 static void seeds_may_be_moved_and_split(void)
 {
     static const double seed[4] = { 0.1, 0.35, 0.73, 0.3504 }, alpha[4] = { 0.1, 0.2, 0.3, 0.4 };
@@ -508,7 +516,6 @@ static void seeds_may_be_moved_and_split(void)
                 k.size_min *= size;
                 error = metro_startup_error_seeds(&k, (uint64_t)n, seed, alpha, 4);
                 single = metro_startup_error(&k, (uint64_t)n);
-                for (i = 0; i < 4; i++) moved[i] = seed[i] + 0.25 * (i - 7);
                 for (i = 0; i < 4; i++) moved[i] = seed[i] + 0.125 + (i - 2) * 3;
                 CHECK_CLOSE(metro_startup_error_seeds(&k, (uint64_t)n, moved, alpha, 4), error, 1e-10 * single);
                 for (i = 0; i < 5; i++) {
@@ -522,13 +529,13 @@ static void seeds_may_be_moved_and_split(void)
             }
 }
 
-/* The sum of eq 5.31 from its far end, for tiny steps (pairs) and others (modes). Catches: pairs beyond their reach, the
-   wrong n in one of the two ways. */
+/* The sum of eq 5.31 from its far end, for tiny steps (pairs) and others (modes). Catches: pairs beyond their reach,
+   the wrong n in one of the two ways. */
 static void seed_sums_agree(void)
 {
     static const double seed[4] = { 0.1, 0.35, -0.27, 7.3504 }, alpha[4] = { 0.1, 0.2, 0.3, 0.4 };
     static const double size[6] = { 0.004, 0.02, 0.3, 0.7, 1.01, 2.5 };
-    int i, n, k, j, terms = (int)check_count(30000, 1000);
+    int i, n, k, j, terms = (int)check_count(30000, 8000);
     for (i = check_scale() < 1 ? 2 : 0; i < 6; i++)
         for (n = 3; n <= 9; n += 3) {
             metro_kernel kernel = kernel_make(n == 6 ? METRO_TRIANGLE : METRO_UNIFORM, size[i], 0, n == 9 ? 0.3 : 0);
@@ -549,11 +556,12 @@ static void seed_sums_agree(void)
 /* ---- The density ---- */
 
 /* p_n over one period by the Gauss rule with 8 points on `pieces` equal pieces: its integral and E^2. */
-static void density_moments(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha, size_t seeds, int pieces,
-                            double *one, double *square)
+static void density_moments(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha, size_t seeds,
+                            int pieces, double *one, double *square)
 {
     static const double node[4] = { 0.1834346424956498, 0.5255324099163290, 0.7966664774136267, 0.9602898564975363 };
-    static const double weight[4] = { 0.3626837833783620, 0.3137066458778873, 0.2223810344533745, 0.1012285362903763 };
+    static const double weight[4] = { 0.3626837833783620, 0.3137066458778873, 0.2223810344533745,
+                                      0.1012285362903763 };
     int i, j;
     *one = *square = 0;
     for (i = 0; i < pieces; i++)
@@ -566,9 +574,9 @@ static void density_moments(const metro_kernel *k, uint64_t n, const double *see
         }
 }
 
-/* The density integrates to 1 and its L2 distance from 1 is the error: eqs 5.5, 5.6 and 5.7. Pieces of 1/40 put the kinks of
-   the uniform and the triangular kernel at their ends. Catches: a
-   seed's weight lost, images that are missing. */
+/* The density integrates to 1 and its L2 distance from 1 is the error: eqs 5.5, 5.6 and 5.7. Pieces of 1/40 put the
+   kinks of the uniform and the triangular kernel at their ends. Catches: a seed's weight lost, images that are
+   missing. */
 static void density_has_the_error(void)
 {
     static const double seed[3] = { 0, 0.25, 0.6 }, alpha[3] = { 0.2, 0.3, 0.5 };
@@ -578,8 +586,9 @@ static void density_has_the_error(void)
     for (shape = 0; shape < 2; shape++)
         for (i = 0; i < 5; i++)
             for (n = 1; n <= 40; n = n < 8 ? n + 1 : n + 9) {
-                metro_kernel k = kernel_make(shape == 0 ? METRO_UNIFORM : METRO_TRIANGLE, size[i], 0, i == 1 ? 0.25 : 0);
-                density_moments(&k, (uint64_t)n, seed, alpha, 3, 80, &one, &square);
+                metro_kernel k =
+                    kernel_make(shape == 0 ? METRO_UNIFORM : METRO_TRIANGLE, size[i], 0, i == 1 ? 0.25 : 0);
+                density_moments(&k, (uint64_t)n, seed, alpha, 3, 40, &one, &square);
                 error = metro_startup_error_seeds(&k, (uint64_t)n, seed, alpha, 3);
                 CHECK_CLOSE(one, 1, 1e-13);
                 CHECK_CLOSE(sqrt(square), error, 1e-8 * error + 1e-13);
@@ -590,16 +599,16 @@ static void density_has_the_error(void)
             int rough = k.shape == METRO_KELEMEN;
             const double *weight = rough ? NULL : alpha;
             if (rough && (n == 5 || check_scale() < 1)) continue;
-            density_moments(&k, (uint64_t)n, seed, weight, rough ? 1 : 3, rough ? 40 : 100, &one, &square);
+            density_moments(&k, (uint64_t)n, seed, weight, rough ? 1 : 3, rough ? 40 : 60, &one, &square);
             error = metro_startup_error_seeds(&k, (uint64_t)n, seed, weight, rough ? 1 : 3);
             CHECK_CLOSE(one, 1, rough ? 1e-4 : 1e-12);
             CHECK_CLOSE(sqrt(square), error, (rough ? 1e-3 : 1e-10) * error + 1e-13);
         }
 }
 
-/* p_{n+1}(x) = int p_n(x - u) P(u) du (eq 5.1) as the mean of p_n over a grid of steps drawn by inversion. Catches: a density of
-   the wrong n, a kernel of the wrong width, a wrong sign or shift of odd powers beyond Delta = 1/2, R of eq 5.25 with a wrong
-   branch. */
+/* p_{n+1}(x) = int p_n(x - u) P(u) du (eq 5.1) as the mean of p_n over a grid of steps drawn by inversion. Catches: a
+   density of the wrong n, a kernel of the wrong width, a wrong sign or shift of odd powers beyond Delta = 1/2, R of
+   eq 5.25 with a wrong branch. */
 static void density_is_a_convolution(void)
 {
     static const metro_shape shape[3] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_KELEMEN };
@@ -624,8 +633,8 @@ static void density_is_a_convolution(void)
             }
 }
 
-/* The same on a grid for the smooth kernels, where the trapezoidal rule is exact. Catches: a mode number off by one, an image
-   or a large step left out. */
+/* The same on a grid for the smooth kernels, where the trapezoidal rule is exact. Catches: a mode number off by one,
+   an image or a large step left out. */
 static void smooth_density_is_a_convolution(void)
 {
     static double p[256], q[256], w[256];
@@ -647,8 +656,8 @@ static void smooth_density_is_a_convolution(void)
     }
 }
 
-/* n = 1 is the kernel's density, jumps included; n = 0 is a point; tails are exact. Catches: a jump counted whole, a density that
-   is not 0 where no step reaches. */
+/* n = 1 is the kernel's density, jumps included; n = 0 is a point; tails are exact. Catches: a jump counted whole, a
+   density that is not 0 where no step reaches. */
 static void density_at_the_edges(void)
 {
     metro_kernel k = uniform(0.25);
@@ -661,7 +670,8 @@ static void density_at_the_edges(void)
     CHECK_NEAR(metro_startup_density(&k, 0, 0.3, seed, NULL, 2), 0.0, 0);
     CHECK_NEAR(metro_startup_density(&k, 0, 0.125, seed, weights, 2), 0.0, 0);
     k = uniform(0.01);
-    for (n = 2; n < 60; n++) CHECK_NEAR(metro_startup_density(&k, (uint64_t)n, 0.5 + 0.0050001 * n, seed, NULL, 1), 0.0, 0);
+    for (n = 2; n < 60; n++)
+        CHECK_NEAR(metro_startup_density(&k, (uint64_t)n, 0.5 + 0.0050001 * n, seed, NULL, 1), 0.0, 0);
     /* the corner of B_n: ((n/2 - y)^{n-1})/(n-1)!/Delta, at y = n/2 - 1/2 */
     CHECK_NEAR(metro_startup_density(&k, 8, 0.535, seed, NULL, 1), pow(0.5, 7) / 5040 / 0.01, 1e-9);
     k = kernel_make(METRO_KELEMEN, 0.25, 0.25, 0);
@@ -673,8 +683,8 @@ static void density_at_the_edges(void)
 
 /* ---- The running mean ---- */
 
-/* M^2 E^2 = sum of e_{i+j}(0) over all pairs of steps, e_s(0) from the density. Catches: c_s wrong at its top, odd powers with the
-   wrong sign, large steps that weigh each power alike. */
+/* M^2 E^2 = sum of e_{i+j}(0) over all pairs of steps, e_s(0) from the density. Catches: c_s wrong at its top, odd
+   powers with the wrong sign, large steps that weigh each power alike. */
 static void mean_is_a_double_sum(void)
 {
     static const double scale[4] = { 0.3, 1.9, 3.3, 3.35 };
@@ -689,7 +699,8 @@ static void mean_is_a_double_sum(void)
                 k.size_min *= scale[i];
                 steps = shape == 5 && i == 0 ? 4 : 9;
                 for (s = 2 * burn; s <= 2 * (burn + steps - 1); s++) {
-                    int c = s - 2 * burn + 1 < 2 * (burn + steps - 1) - s + 1 ? s - 2 * burn + 1 : 2 * (burn + steps - 1) - s + 1;
+                    int c = s - 2 * burn + 1 < 2 * (burn + steps - 1) - s + 1 ? s - 2 * burn + 1
+                                                                              : 2 * (burn + steps - 1) - s + 1;
                     sum += c * (metro_startup_density(&k, (uint64_t)s, 0, &zero, NULL, 1) - 1);
                 }
                 /* the density has lost what is small against 1 */
@@ -698,13 +709,14 @@ static void mean_is_a_double_sum(void)
             }
 }
 
-/* Long runs against the sum over modes, from its far end, where that converges. Catches: a short circle that is too short, the
-   tail of eq 5.42 for eq 5.43, the Euler-Maclaurin panels. */
+/* Long runs against the sum over modes, from its far end, where that converges. Catches: a short circle that is too
+   short, the tail of eq 5.42 for eq 5.43, the Euler-Maclaurin panels. */
 static void long_means_agree_with_modes(void)
 {
     static const double steps[5] = { 2, 1000, 1e5, 1e9, 1e18 };
     static const double size[7] = { 0.02, 0.15, 0.01, 0.002, 3e4, 0.7, 1.2 };
-    static const metro_shape shape[7] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN, METRO_CAUCHY, METRO_VON_MISES, METRO_UNIFORM, METRO_TRIANGLE };
+    static const metro_shape shape[7] = { METRO_UNIFORM,   METRO_TRIANGLE, METRO_GAUSSIAN, METRO_CAUCHY,
+                                          METRO_VON_MISES, METRO_UNIFORM,  METRO_TRIANGLE };
     int i, j, burn, k;
     for (i = 0; i < 7; i++)
         for (j = 0; j < 5; j++)
@@ -723,8 +735,9 @@ static void long_means_agree_with_modes(void)
             }
 }
 
-/* Sums that keep every digit: Gaussian modes when M goes to infinity, M^2 E^2 = 2 sum 1/(e^{a k^2} - 1)^2, and Cauchy powers one
-   by one. Catches: 1 - P formed near 1, the correction of the Euler-Maclaurin panels left out or upside down. */
+/* Sums that keep every digit: Gaussian modes when M goes to infinity, M^2 E^2 = 2 sum 1/(e^{a k^2} - 1)^2, and Cauchy
+   powers one by one. Catches: 1 - P formed near 1, the correction of the Euler-Maclaurin panels left out or upside
+   down. */
 static void long_means_keep_their_digits(void)
 {
     static const double size[4] = { 1e-6, 1e-4, 1e-3, 0.01 };
@@ -739,8 +752,8 @@ static void long_means_keep_their_digits(void)
             k = kernel_make(METRO_CAUCHY, size[i], 0, j % 2 == 0 ? 0 : 1e-4);
             sum = 0;
             for (s = 2 * steps[j]; s >= 2; s--)
-                sum += (s - 1 < 2 * steps[j] - s + 1 ? s - 1 : 2 * steps[j] - s + 1) * 2 / expm1(2 * pi * size[i] * s)
-                     * exp(s * log1p(-k.large));
+                sum += (s - 1 < 2 * steps[j] - s + 1 ? s - 1 : 2 * steps[j] - s + 1) * 2 /
+                       expm1(2 * pi * size[i] * s) * exp(s * log1p(-k.large));
             CHECK_NEAR(steps[j] * metro_startup_error_mean(&k, 1, (uint64_t)steps[j]), sqrt(sum), 1e-12);
         }
     }
@@ -748,8 +761,8 @@ static void long_means_keep_their_digits(void)
 
 /* ---- The interval and d dimensions ---- */
 
-/* Eq 5.33 with chapter 3's eigenvalues, and what follows from symmetry. Catches: x0 folded wrongly, the size not halved, the
-   middle that is not the circle. */
+/* Eq 5.33 with chapter 3's eigenvalues, and what follows from symmetry. Catches: x0 folded wrongly, the size not
+   halved, the middle that is not the circle. */
 static void interval_agrees_with_its_modes(void)
 {
     static const double x0[6] = { 0, 0.2, 0.5, 0.77, 1, 1.3 };
@@ -771,7 +784,8 @@ static void interval_agrees_with_its_modes(void)
         for (n = 1; n < 1000; n *= 3) {
             metro_kernel kernel = specimen(shape);
             double end = metro_reflect_startup_error(&kernel, 0, (uint64_t)n);
-            CHECK_NEAR(metro_reflect_startup_error(&kernel, 0.5, (uint64_t)n), metro_startup_error(&kernel, (uint64_t)n), 0);
+            CHECK_NEAR(metro_reflect_startup_error(&kernel, 0.5, (uint64_t)n),
+                       metro_startup_error(&kernel, (uint64_t)n), 0);
             CHECK_NEAR(metro_reflect_startup_error(&kernel, 1, (uint64_t)n), end, 1e-12);
             CHECK_NEAR(metro_reflect_startup_error(&kernel, 0.3, (uint64_t)n),
                        metro_reflect_startup_error(&kernel, 0.7, (uint64_t)n), 1e-8);
@@ -828,7 +842,8 @@ static void distances_bound_the_density(void)
                 CHECK_NEAR(metro_startup_total_variation(&k, 1), variation, 1e-9);
                 CHECK_NEAR(metro_startup_divergence(&k, 1), divergence, 1e-9);
             } else {
-                CHECK(metro_startup_total_variation(&k, (uint64_t)n) > variation * (1 - 1e-9), "shape %d n %d", shape, n);
+                CHECK(metro_startup_total_variation(&k, (uint64_t)n) > variation * (1 - 1e-9), "shape %d n %d", shape,
+                      n);
                 CHECK(metro_startup_divergence(&k, (uint64_t)n) > divergence * (1 - 1e-9), "shape %d n %d", shape, n);
                 CHECK(metro_startup_total_variation(&k, (uint64_t)n) <= 1, "shape %d n %d", shape, n);
             }
@@ -844,7 +859,8 @@ static void distances_bound_the_density(void)
     for (p = 5.5; p < 1e7; p = 10 * p + 0.5) {
         metro_kernel k = uniform(p);
         double u = 0.25 / (p * p);
-        CHECK_NEAR(metro_startup_divergence(&k, 1), u * (1.0 / 2 + u * (1.0 / 12 + u * (1.0 / 30 + u * (1.0 / 56 + u / 90)))), 1e-12);
+        CHECK_NEAR(metro_startup_divergence(&k, 1),
+                   u * (1.0 / 2 + u * (1.0 / 12 + u * (1.0 / 30 + u * (1.0 / 56 + u / 90)))), 1e-12);
     }
 }
 
@@ -869,8 +885,11 @@ static void check_all(const metro_kernel *k, uint64_t n, double error, double lo
     for (i = 0; i < 10; i++) {
         double truth = i < 5 ? error : logarithm;
         if (k->shape == METRO_VON_MISES && i % 5 == 4) truth = (double)NAN;
-        if (isnan(truth)) CHECK(isnan(value[i]), "function %d of shape %d size %g: %g", i, (int)k->shape, k->size, value[i]);
-        else CHECK(value[i] == truth, "function %d of shape %d size %g at n = %g: %g", i, (int)k->shape, k->size, (double)n, value[i]);
+        if (isnan(truth))
+            CHECK(isnan(value[i]), "function %d of shape %d size %g: %g", i, (int)k->shape, k->size, value[i]);
+        else
+            CHECK(value[i] == truth, "function %d of shape %d size %g at n = %g: %g", i, (int)k->shape, k->size,
+                  (double)n, value[i]);
     }
 }
 
@@ -949,7 +968,8 @@ static void nonsense_is_nan(void)
     check_all(&k, 3, nan, nan);
 }
 
-/* Failures: alpha. Catches: weights that are normalised silently, a sum of absolute values, NULL taken for a fault. */
+/* Failures: alpha. Catches: weights that are normalised silently, a sum of absolute values, NULL taken for a fault.
+   */
 static void weights_are_checked(void)
 {
     static const double good[3] = { 0.2, 0.3, 0.5 };
@@ -977,7 +997,8 @@ static void weights_are_checked(void)
                 CHECK_NAN(metro_startup_log_error_seeds(&k, n, seed, alpha, 3));
                 CHECK_NAN(metro_startup_density(&k, n, 0.2, seed, alpha, 3));
             } else {
-                CHECK_NEAR(metro_startup_error_seeds(&k, n, seed, alpha, 3), metro_startup_error_seeds(&k, n, seed, good, 3), 1e-8);
+                CHECK_NEAR(metro_startup_error_seeds(&k, n, seed, alpha, 3),
+                           metro_startup_error_seeds(&k, n, seed, good, 3), 1e-8);
             }
         }
         for (i = 0; i < 3; i++) {
