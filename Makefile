@@ -13,7 +13,7 @@
 CC ?= cc
 CFLAGS ?= -O2
 PREFIX ?= /usr/local
-LDLIBS = -lm -lpthread
+LDLIBS = -lm
 WARNINGS = -std=c99 -Wall -Wextra -pedantic
 
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 1)

@@ -19,11 +19,9 @@
 
    - METRO_STATIC: all functions are static, so that several files may carry their own copy.
    - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
-   - METRO_ASSERT: what a programmer's error ends in; assert by default.
    - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
-   - METRO_NO_TRACER: leaves out the chapters on light, so that a lesson on the sampler compiles in a blink.
 
-   This program asks both the theory and an experiment how much a chain remembers of its seed:
+   This program follows one chain, and prints beside it how much of the seed theory says is left:
 
        #define METRO_IMPLEMENTATION
        #include "metro.h"
@@ -145,11 +143,14 @@
        B Symbols
        C License
 
-   Stop here if you only want to use the header: the interface comes next, and its comments are the contracts.
-   The chapters follow it. */
+   To use the header, read the interface, which comes next: its comments are the contracts. The chapters follow it. */
 
 #ifndef METRO_H
 #define METRO_H
+
+#if !defined(__cplusplus) && (!defined(__STDC_VERSION__) || __STDC_VERSION__ < 199901L)
+#error "metro.h needs C99 or later: compile with -std=c99"
+#endif
 
 #include <stddef.h>
 #include <stdint.h>
@@ -179,7 +180,7 @@ extern "C" {
 /* # R1 Ground
 
    Every function that can fail returns a `metro_result`. Zero is success; anything else is an error, and then the
-   outputs are as they were before the call. */
+   outputs are as they were before the call, unless the contract says otherwise. */
 
 typedef enum {
     METRO_OK = 0,
@@ -220,7 +221,7 @@ typedef struct {
     uint64_t rounds;         /* how many rounds; 0 means 1 */
     uint64_t first_round;    /* the number of the first one, to go on where an earlier run ended */
     size_t jobs;             /* jobs in a round; 0 means 16 */
-    size_t slot_size;        /* bytes that a job writes; 0 is allowed */
+    size_t slot_size;        /* bytes that a job writes, a multiple of the alignment it needs; 0 is allowed */
     size_t threads;          /* 0 means one a core */
     /* Does job `job` (counted over all rounds: round * jobs + index) and leaves its outcome in `slot`, which arrives
        zeroed. Runs on any thread, and must not write anything that `user` reaches. */
@@ -233,8 +234,9 @@ typedef struct {
 
 /* Runs `plan`, handing `user` to its functions. Returns METRO_OK after the last round, METRO_ERROR_STOPPED when
    `stop` asked for it, METRO_ERROR_MEMORY, METRO_ERROR_ARGUMENT (`work` is NULL or the slots overflow a size), or the
-   first result other than METRO_OK that a job returned, in the order of jobs; the round of that job is not merged.
-   Costs jobs * slot_size bytes and one thread creation a thread and round. */
+   first result other than METRO_OK that a job returned, in the order of jobs; the round of that job is not merged. A
+   `merge` that fails ends the run with its result; earlier slots stay merged. At most 257 threads work. Costs jobs *
+   slot_size bytes and one thread creation a thread and round. */
 METRO_API metro_result metro_rounds_run(const metro_rounds *plan, void *user);
 
 /* The number of cores this process may use, at least 1. */
@@ -345,9 +347,9 @@ METRO_API double metro_kernel_coefficient(const metro_kernel *k, long harmonic);
 
 /* The same three on the interval [0, 1] whose ends reflect: a point beyond an end comes back as far as it went over.
    The new point lies in [0, 1) - the end 1 itself, met once in 2^53, is moved to the number below it, so that
-   (size_t)(n * x) is always a cell - and `x` beyond the ends is folded first. The coefficient is the eigenvalue mu_k
-   of cos(pi k x), the transform of the kernel at frequency k/2. METRO_VON_MISES lives on the circle only and gives
-   NaN. */
+   (size_t)(n * x) is always a cell - and `x` beyond the ends is folded together with its step. The coefficient is the
+   eigenvalue mu_k of cos(pi k x), the transform of the kernel at frequency k/2. METRO_VON_MISES lives on the circle
+   only and gives NaN. */
 METRO_API double metro_kernel_reflect_perturb(const metro_kernel *k, double x, metro_rng *rng);
 METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from, double to);
 METRO_API double metro_kernel_reflect_coefficient(const metro_kernel *k, long harmonic);
@@ -359,7 +361,8 @@ METRO_API double metro_kernel_reflect_coefficient(const metro_kernel *k, long ha
    the frame is that of Duff et al. (2017). */
 METRO_API metro_vec3 metro_cone_perturb(double half_angle, metro_vec3 from, metro_rng *rng);
 
-/* Its density per steradian between the unit vectors `from` and `to`, the same both ways. NaN as above. */
+/* Its density per steradian between the unit vectors `from` and `to`, the same both ways. NaN when `half_angle` is
+   not positive and finite or a component is NaN; lengths are not checked. */
 METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_vec3 to);
 
 /* The eigenvalue lambda_l of the spherical harmonics of degree l = `degree` under the cone of `half_angle` radians.
@@ -369,41 +372,87 @@ METRO_API double metro_cone_coefficient(double half_angle, int degree);
 
 /* The von Mises-Fisher kernel exp(kappa cos theta) on the sphere, theta the angle from the unit vector `from`: drawn,
    as a density per steradian, and its eigenvalue of degree `degree`. kappa = 0 is the uniform direction; NaN when
-   kappa is negative or not finite, `from` is not of length 1, or `degree` is negative. Cost: two random numbers and
-   some 60 ns; the coefficient at most 10 us. Source: Ulrich (1984) in the stable form of Jakob (2012). */
+   kappa is negative or not finite, `degree` is negative, or (drawn only) `from` is not of length 1. Cost: two random
+   numbers and some 60 ns; the coefficient at most 10 us. Source: Ulrich (1984) in the stable form of Jakob (2012). */
 METRO_API metro_vec3 metro_vmf_perturb(double kappa, metro_vec3 from, metro_rng *rng);
 METRO_API double metro_vmf_density(double kappa, metro_vec3 from, metro_vec3 to);
 METRO_API double metro_vmf_coefficient(double kappa, int degree);
 
 /* # R4 The chain
 
-   A target is a space, an importance on it and what to do with samples. The space is a list of axes. A circle or an
-   interval takes one coordinate of the state, in [0, 1]; a direction takes three, a vector of length 1. Volumes are
-   measured so that each axis has total volume 1: a uniform draw has density 1. */
+   A target is a space, an importance on it and what to do with samples. The importance I(z) says how much we want to
+   see of the state z, in any unit: how bright the picture is there, say. A chain of states proposes a tentative
+   state, accepts or rejects it, and in the long run visits each place in proportion to its importance.
+
+   The space is a list of axes. A circle or an interval takes one coordinate of the state, in [0, 1]; a direction
+   takes three, a vector of length 1. Volumes are measured so that each axis has total volume 1: a uniform draw has
+   density 1.
+
+   The order of calls is make, start, run, read, free. This program samples an importance of two coordinates and
+   prints its integral b, and the mean of the first coordinate under it:
+
+       #define METRO_IMPLEMENTATION
+       #include "metro.h"
+
+       static double bright(const double *z, void *sample, void *user)
+       {
+           (void)user;
+           *(double *)sample = z[0];
+           return z[0] * z[0] + 0.1 * z[1];
+       }
+
+       static void add(const void *sample, double weight, void *user)
+       {
+           metro_sum_add((metro_sum *)user, weight * *(const double *)sample);
+       }
+
+       int main(void)
+       {
+           metro_axis axes[2] = { { METRO_INTERVAL, { METRO_UNIFORM, 0.3, 0, 0 } },
+                                  { METRO_CIRCLE, { METRO_GAUSSIAN, 0.1, 0, 0 } } };
+           metro_sum sum = { 0, 0 };
+           metro_target target = { axes, 2, sizeof(double), bright, add, NULL, &sum };
+           metro_chain_options options = { 0.1, 1 };
+           metro_chain chain;
+           double b, error;
+           metro_result result = metro_chain_make(&target, &options, metro_rng_make(1, 0), &chain);
+           if (result == METRO_OK) result = metro_chain_start_weighted(&chain, 1000);
+           if (result != METRO_OK) {
+               printf("%s\n", metro_result_text(result));
+               return 1;
+           }
+           metro_chain_run(&chain, 100000);
+           b = metro_chain_b(&chain, &error);
+           printf("b = %.4f +- %.4f, mean %.4f\n", b, error, metro_sum_value(&sum) / (double)chain.counts.steps);
+           metro_chain_free(&chain);
+           return 0;
+       }
+*/
 
 typedef enum { METRO_CIRCLE, METRO_INTERVAL, METRO_DIRECTION } metro_axis_kind;
 
 /* One axis and how it is perturbed. METRO_INTERVAL reflects at its ends and takes every shape but METRO_VON_MISES.
    METRO_DIRECTION takes METRO_UNIFORM, a cone whose half-angle in radians is `size` (half the paper's apex angle), or
-   METRO_VON_MISES, the von Mises-Fisher kernel of concentration `size`. `large` must be 0 here: the large step of a
-   chain redraws all axes together and is an option of the chain. */
+   METRO_VON_MISES, the von Mises-Fisher kernel of concentration `size`. On every kind of axis `large` must be 0: the
+   large step of a chain redraws all axes together and is an option of the chain. */
 typedef struct {
     metro_axis_kind kind;
     metro_kernel kernel;
 } metro_axis;
 
-/* What the chain samples. The functions get `user` as it stands here; the chain calls them and keeps nothing of them.
-   */
+/* What the chain samples. The chain copies this struct, but not the axes or what `user` points to. The functions get
+   `user` as it stands here. */
 typedef struct {
     const metro_axis *axes;  /* [axis_count]; must outlive the chain */
     size_t axis_count;
-    size_t sample_size;      /* bytes of a sample, may be 0 */
+    size_t sample_size;      /* bytes that `importance` may write to `sample`; may be 0 */
     /* The importance I(z) >= 0 of the state z; whatever the target wants to record about z goes into `sample`. */
     double (*importance)(const double *z, void *sample, void *user);
     /* Takes a sample with its weight; the weights of a step sum to 1. NULL: nothing is recorded. */
     void (*record)(const void *sample, double weight, void *user);
-    /* The tentative transition: writes the tentative state to `to` and returns T(to -> from) / T(from -> to). NULL:
-       each axis is perturbed by its kernel, which is symmetric. */
+    /* The tentative transition: writes the tentative state to `to` and returns T(to -> from) / T(from -> to). It need
+       not stay in the space if the importance is 0 outside. NULL: each axis is perturbed by its kernel, which is
+       symmetric. */
     double (*propose)(const double *from, double *to, metro_rng *rng, void *user);
     void *user;
 } metro_target;
@@ -445,22 +494,24 @@ typedef struct {
 } metro_chain;
 
 /* Makes a chain for `target` that draws from `rng`. `options` may be NULL. Returns METRO_ERROR_ARGUMENT for no axes,
-   no importance, a kernel that is not valid on its axis, or large_step outside [0, 1]; METRO_ERROR_MEMORY; on failure
-   `chain` is unchanged. Costs one allocation of two states and two samples; a step allocates nothing. */
+   no importance, a kernel that is not valid on its axis (not looked at when the target proposes), or large_step
+   outside [0, 1]; METRO_ERROR_MEMORY; on failure `chain` is unchanged. Costs one allocation of two states and two
+   samples; a step allocates nothing. */
 METRO_API metro_result metro_chain_make(const metro_target *target, const metro_chain_options *options, metro_rng rng,
                                         metro_chain *chain);
 
 /* Frees what metro_chain_make allocated. A zeroed chain may be freed. */
 METRO_API void metro_chain_free(metro_chain *chain);
 
-/* Starts the chain at the state z, as the paper does. Returns METRO_ERROR_DARK_SEED if I(z) = 0, METRO_ERROR_BAD_SEED
-   if it is negative, infinite or NaN; the chain is then where it was. A start sets the counts to zero and keeps what
-   is known of b. */
+/* Starts the chain at the state z, a point of the space, as the paper does. Returns METRO_ERROR_DARK_SEED if I(z) =
+   0, METRO_ERROR_BAD_SEED if it is negative, infinite or NaN; the chain is then where it was. A start sets the counts
+   to zero and keeps what is known of b. */
 METRO_API metro_result metro_chain_start_point(metro_chain *chain, const double *z);
 
 /* Starts at the seed z_i, chosen with probability alpha_i (paper (13)). `seeds` states follow each other in z;
-   `alpha` has `seeds` numbers whose sum is 1 within 1e-9, or is NULL for equal ones. One dark or bad seed among them
-   refuses all, as in metro_chain_start_point, since it could be chosen. Cost: `seeds` importances. */
+   `alpha` has `seeds` numbers whose sum is 1 within 1e-9, or is NULL for equal ones. Returns METRO_ERROR_ARGUMENT for
+   no seeds or other weights. One dark or bad seed refuses all, as in metro_chain_start_point, even one of weight 0.
+   Cost: `seeds` + 1 importances. */
 METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double *z, const double *alpha,
                                                size_t seeds);
 
@@ -471,7 +522,8 @@ METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double 
    no candidates. The candidates also enter the normalisation. */
 METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t candidates);
 
-/* Makes `steps` steps without recording and sets the counts to zero: a burn-in. */
+/* Makes `steps` steps without recording and sets the counts to zero: a burn-in. What the current sample has collected
+   is dropped (flush first to keep it); large steps still count for b. */
 METRO_API void metro_chain_burn(metro_chain *chain, uint64_t steps);
 
 /* Makes one step and returns 1 if the tentative state was accepted, else 0. A sample is recorded when the chain
@@ -500,7 +552,8 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error);
    Common to all of them: n = 0 gives +INFINITY, because p_0 is a point mass; an invalid kernel (metro_kernel says
    which are valid) gives NaN. A kernel that lands uniformly in one step (METRO_UNIFORM of whole `size`,
    METRO_TRIANGLE of even `size`, METRO_VON_MISES of concentration 0, `large` = 1) has an error of exactly 0 for n >=
-   1. METRO_KELEMEN with `size_min` == `size` jumps between points, so its error is +INFINITY for every n (with
+   1 (on the circle; on the interval from any seed METRO_UNIFORM needs an even `size` and METRO_TRIANGLE a multiple of
+   4). METRO_KELEMEN with `size_min` == `size` jumps between points, so its error is +INFINITY for every n (with
    `large` = 1: 0). Nothing here allocates.
 
    Each error comes a second time as its natural logarithm, which is finite where the error itself underflows:
@@ -539,9 +592,10 @@ METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t bu
 /* The density p_n at `x` (taken modulo 1) of a chain that starts as in metro_startup_error_seeds: eqs 5.5 and 5.30,
    paper (9) and (14). n = 0: +INFINITY at a seed of positive weight, 0 elsewhere. n = 1: metro_kernel_density, so at
    a jump the mean of both sides. NaN for the arguments that give NaN there, for an `x` that is not finite, and for
-   METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density. The error is below 1e-13 of the
-   largest value of p_n (METRO_KELEMEN from n = 5 on: 1e-12 while C is below 50, else as above). Cost: 0.1 to 2
-   microseconds a seed, METRO_VON_MISES 12; METRO_KELEMEN: 0.2 ms at n = 3 and 4, 15 ms at n = 5, less beyond. */
+   METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density, or of a size above 10000 at n = 2
+   and 3. The error is below 1e-13 of the largest value of p_n (METRO_KELEMEN from n = 5 on: 1e-12 while C is below
+   50, else as above). Cost: 0.1 to 2 microseconds a seed, METRO_VON_MISES 12; METRO_KELEMEN: 0.2 ms at n = 3 and 4,
+   15 ms at n = 5, less beyond. */
 METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
                                        const double *alpha, size_t seeds);
 
@@ -561,8 +615,8 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
    int abs(p_n - 1), at most min(1, E_n/2), and the Kullback-Leibler divergence int p_n ln p_n in nats, at most ln(1 +
    E_n^2): eqs 5.46 and 5.47. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
    5.48 and 5.49. At n = 0 the distances are 1 and +INFINITY. */
-METRO_API double metro_startup_total_variation(const metro_kernel *k, uint64_t n);
-METRO_API double metro_startup_divergence(const metro_kernel *k, uint64_t n);
+METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n);
+METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n);
 
 /* # R5.1 Start-up theory on the sphere and of a run */
 
@@ -594,14 +648,14 @@ typedef struct {
 
    with cosine[j - 1] and sine[j - 1]; a constant would change nothing. Either array may be NULL for all zeros. The
    chain starts at seed[i] with probability alpha[i], i < `seeds` (`alpha` NULL: equal weights; weights as for
-   metro_startup_error_seeds); with `seeds` = 0 it starts from a uniform point. The mean over seeds of the square of
-   what each of them is off by is part of the mean squared error, so seeds that are off in different directions show
-   in the variance. steps = 0 asks for the limit of many steps: then the three numbers are the limits of steps * bias,
-   steps * variance and steps * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite,
-   seeds or weights that metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is
-   untouched then. Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0
-   is exactly 0. Cost: some 0.1 us for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
-   and 5 ns for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a pair. */
+   metro_startup_error_seeds); with `seeds` = 0 it starts from a uniform point. Drawing the seed is part of the
+   experiment: where seeds have different biases, the variance of these adds to the variance of the run. steps = 0
+   asks for the limit of many steps: then the three numbers are the limits of steps * bias, steps * variance and steps
+   * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite, seeds or weights that
+   metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is untouched then.
+   Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0 is exactly 0.
+   Cost: some 0.1 us for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`, and 5 ns for
+   each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a pair. */
 METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
                                                const double *cosine, const double *sine, size_t harmonics,
                                                const double *seed, const double *alpha, size_t seeds,
@@ -633,11 +687,11 @@ typedef struct {
     double acceptance;   /* the mean of 1 - r_i in equilibrium */
 } metro_operator;
 
-/* Makes the operator of `kernel`, whose shape must be METRO_UNIFORM (no figure needs another), for the importance of
-   each cell. `importance` holds `cells` numbers, not negative and finite, in any unit: only their ratios count. On
-   success free with metro_operator_free. Returns METRO_ERROR_ARGUMENT for another shape, an invalid kernel, no cells
-   or an importance that is negative, infinite or NaN; METRO_ERROR_NO_IMPORTANCE if all are 0; METRO_ERROR_MEMORY; on
-   failure `op` is unchanged. Costs cells^2 doubles and divisions. Source: eq 6.1 to eq 6.5. */
+/* Makes the operator of `kernel`, whose shape must be METRO_UNIFORM (eq 6.1 is the matrix of that kernel), for the
+   importance of each cell. `importance` holds `cells` numbers, not negative and finite, in any unit: only their
+   ratios count. On success free with metro_operator_free. Returns METRO_ERROR_ARGUMENT for another shape, an invalid
+   kernel, no cells or an importance that is negative, infinite or NaN; METRO_ERROR_NO_IMPORTANCE if all are 0;
+   METRO_ERROR_MEMORY; on failure `op` is unchanged. Costs cells^2 doubles and divisions. Source: eq 6.1 to eq 6.5. */
 METRO_API metro_result metro_operator_make(const metro_kernel *kernel, const double *importance, size_t cells,
                                            metro_operator *op);
 
@@ -793,7 +847,7 @@ METRO_API double metro_ess_mean(const double *draw, size_t chains, size_t draws)
    distances from the median (are they as wide?). +INFINITY when every chain stands still and not all at the same
    place. NaN under four draws a chain, or when all draws are equally far from the median. It compares chains with
    each other, never with the truth: where no chain has been, it knows nothing. Cost: three sorts. Source: Vehtari et
-   al. (2021), rank-normalised split R-hat; the same numbers as posterior. */
+   al. (2021), rank-normalised split R-hat; the same numbers as posterior, but where every chain stands still. */
 METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws);
 
 /* The Monte Carlo standard error of the mean of all draws, and of their standard deviation: the deviation of the
@@ -829,17 +883,19 @@ typedef struct {
    variance are NaN, under three so are their errors, and under two the error of the mean squared error. NaN or an
    infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or a
    NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
-   Source: Quenouille (1956), Efron and Stein (1981). */
+   Source: Tukey (1958), Efron and Stein (1981). */
 METRO_API metro_result metro_repeats(const double *estimate, const double *truth, size_t repeats, size_t values,
                                      metro_bias_variance *out);
 
-/* The outcome of a check of detailed balance. `probability` is the chance that a correct transition scores
-   `chi_square` or more: under 1e-6 the transition is wrong. */
+/* The outcome of a check of detailed balance. `probability` is the chance that a transition in balance scores
+   `chi_square` or more, times the number of coordinates, at most 1: under 1e-6 detailed balance is broken. A step may
+   break it and yet leave the target as it is, as a rotation of a circle does; and what shows in no single coordinate
+   is not seen. */
 typedef struct {
     double chi_square, freedom, probability;
     size_t coordinate;  /* of the state, the one that scores worst */
     size_t from, to;    /* the two cells of that coordinate between which the flows differ most */
-    double excess;      /* the flow from -> to less the flow back, as a part of their sum, -1 .. 1 */
+    double excess;      /* the flow from -> to less the flow back, as a part of their sum, 0 .. 1 */
 } metro_balance;
 
 /* Tests a transition against the target that it should leave in balance (eq 7.15). `step` writes the state after
@@ -861,7 +917,7 @@ typedef struct {
     const metro_chain_options *options;  /* NULL for the defaults */
     const double *seed, *alpha;          /* `seeds` states and their probabilities, as in metro_chain_start_seeds */
     size_t seeds;
-    const uint64_t *steps;               /* [times], increasing: when to look */
+    const uint64_t *steps;               /* [times], never falling: when to look */
     size_t times;
     uint64_t chains;                     /* rounded up to a multiple of the jobs */
     size_t harmonics;                    /* K: the highest harmonic along each axis */
@@ -875,8 +931,9 @@ typedef struct {
    after steps[i] steps and may be negative where E_n is small; error[i] is its standard error (eq 7.18), somewhat too
    large where nothing of E_n is left. Both have `times` values. What lies beyond K is not in the sum: for a uniform
    perturbation and n = 1 it is about 2/(pi^2 Delta^2 K), for larger n far less. Returns the errors of the chain,
-   METRO_ERROR_ARGUMENT also for an axis that is a direction, for over 2^20 modes or fewer than 4 jobs; then the
-   outputs are untouched. Costs chains * (last step + times * axes * modes). */
+   METRO_ERROR_ARGUMENT also for no harmonics, times, chains or seeds, for step numbers that fall, for an axis that is
+   a direction, for over 2^20 modes or fewer than 4 jobs; then the outputs are untouched. Costs chains * (last step +
+   times * axes * modes) and some 32 bytes a job, time and mode. */
 METRO_API metro_result metro_ensemble_measure(const metro_ensemble *ensemble, double *squared, double *error);
 
 /* # R8 Pictures
@@ -985,10 +1042,6 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
 #define METRO_REALLOC(pointer, size) realloc(pointer, size)
 #define METRO_FREE(pointer) free(pointer)
 #endif
-#ifndef METRO_ASSERT
-#include <assert.h>
-#define METRO_ASSERT(condition) assert(condition)
-#endif
 #define METROI_PI 3.14159265358979323846
 #define METROI_NAN ((double)NAN)
 #define METROI_INFINITY ((double)INFINITY)
@@ -1026,7 +1079,7 @@ METRO_API const char *metro_result_text(metro_result result)
 
 /* # 1.2 Vectors
 
-   Directions carry the light in the later chapters and are states of a chain in this one. A vector is three doubles,
+   Directions are states of a chain (chapter 4). A vector is three doubles,
    passed by value. */
 
 METRO_API metro_vec3 metro_vec3_make(double x, double y, double z)
@@ -1392,11 +1445,11 @@ METRO_API double metro_moments_error(const metro_moments *moments)
 
 /* # 2.3 Points that fill the cube evenly
 
-   Random points clump: of $N$ points in $N$ cells of equal size more than a third of the cells stay empty. A sequence
-   that puts exactly one into each cell, for many ways of cutting the cube into cells, integrates smooth functions
-   with an error that falls almost as $1/N$, and shuffled as below almost as $N^{-3/2}$, where random points have
-   $N^{-1/2}$. Sobol (1967) found one that needs only binary digits. The digits of the number of the point, $n_1$ the
-   lowest, choose which direction numbers $v_j$ are added up, digit by digit modulo 2:
+   Random points clump: of $N$ points in $N$ cells of equal size more than a third stay empty on average when N is
+   large. A sequence that puts exactly one into each cell, for many ways of cutting the cube into cells, integrates
+   smooth functions with an error that falls almost as $1/N$, and shuffled as below almost as $N^{-3/2}$, where random
+   points have $N^{-1/2}$. Sobol (1967) found one that needs only binary digits. The digits of the number of the
+   point, $n_1$ the lowest, choose which direction numbers $v_j$ are added up, digit by digit modulo 2:
 
        x = sum_{j=1}^{24} n_j v_j,   v_j = frac{m_j}{2^j}                             (2.2)
 
@@ -1498,7 +1551,8 @@ static uint32_t metroi_sobol_digits(uint32_t index, unsigned dimension)
 
    Each interval of length $2^{-k}$ is carried onto another as a whole, so the points stay as even as they were, while
    each one becomes uniform. For every square-integrable function the variance falls faster than 1/N, and it stays
-   within a bounded factor of that of random points (Owen 1997).
+   within a factor of that of random points which depends on the points and the dimension, not on N or the function
+   (Owen 1997; for Sobol's points Owen 1998).
 
    The coins $c$ sit in the nodes of a binary tree: the root decides digit 1, and node $i$ has the children $2i$ and
    $2i+1$ for the digits 0 and 1. Nobody can store 2^24 of them, so they are hashes. (Laine and Karras 2011 flip all
@@ -2088,7 +2142,7 @@ static void metroi_sinc_mode(double frequency, double h, double *value, double *
         *gap = metroi_sinc_gap(y);
         *value = 1 - *gap;
     } else {
-        *value = y < 1e300 ? metroi_sin_pi(frequency, h) / y : 0;
+        *value = y < 1e300 ? metroi_sin_pi(frequency, h) / y : 0; /* eq 5.17 */
         *gap = 1 - *value;
     }
 }
@@ -2407,12 +2461,11 @@ METRO_API double metro_vmf_coefficient(double kappa, int degree)
 }
 
 #undef METROI_FAR_STEP
-#undef METROI_DEBYE
 
 /* # 4 The chain
 
-   This chapter is the sampler, and there is no other: the one-dimensional laboratory, the light paths and the ray
-   bundles are targets of the same chain.
+   This chapter is the sampler, and there is no other: every space, one-dimensional or of many directions, is a target
+   of the same chain.
 
    We want the integral of a vector-valued f, and have an importance I, a number that is large where f is. If
    states $z_i$ come with density I(z)/b, where b is the integral of I, then (paper (2))
@@ -2429,10 +2482,10 @@ METRO_API double metro_vmf_coefficient(double kappa, int degree)
 
        a(i -> t) = min(1, frac{I(t) T(t -> i)}{I(i) T(i -> t)})                                              (4.2)
 
-   The printed algorithm of the paper has T the other way round, $I(t) T(i -> t)$ over $I(i) T(t -> i)$ in effect,
-   since its own T cancels. On a ring of five states with T = .7 to the right and .3 to the left and target (.05, .1,
-   .15, .2, .5) that form converges to (.055, .066, .089, .150, .640); eq 4.2 gives the target. With it, the flow from
-   i to t and the flow back are equal when the density is I/b,
+   The paper prints $I(t) T(i -> t)$ over $I(i) T(i -> t)$. There T cancels, and what is left, I(t)/I(i), is right for
+   a symmetric T only. On a ring of five states with T = .7 to the right and .3 to the left and target (.05, .1, .15,
+   .2, .5) the printed form converges to (.055, .066, .089, .150, .640), and eq 4.2 to the target. With eq 4.2 the
+   flow from i to t and the flow back are equal when the density is I/b,
 
        I(i) T(i -> t) a(i -> t) = min(I(i) T(i -> t), I(t) T(t -> i)) = I(t) T(t -> i) a(t -> i)             (4.3)
 
@@ -2455,10 +2508,10 @@ static double metroi_acceptance(double current, double tentative, double ratio)
 
 static double metroi_count_value(metro_chain_counts *counts, double value)
 {
+    if (value >= 0 && value < METROI_INFINITY) return value;
     if (isnan(value)) counts->nan++;
     else if (value < 0) counts->negative++;
-    else if (isinf(value)) counts->infinite++;
-    else return value;
+    else counts->infinite++;
     return 0;
 }
 
@@ -2642,8 +2695,9 @@ METRO_API void metro_chain_flush(metro_chain *chain)
 }
 
 /* A step ends in the tentative state with probability a and in the current one otherwise. Instead of recording the
-   one that chance picks we may record both, each with its probability, which has the same mean and a smaller variance
-   (Veach and Guibas 1997 call it expected values): for any h, given the states i and t,
+   one that chance picks we may record both, each with its probability, which has the same mean and, for the one step,
+   a smaller variance (Veach and Guibas 1997 call it expected values). Over a run it usually helps, but it need not
+   (Delmas and Jourdain 2009). For any h, given the states i and t,
 
        E[h(z_next)] = a(i -> t) h(t) + (1 - a(i -> t)) h(i)                                                  (4.4)
 
@@ -2770,9 +2824,9 @@ METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double 
 
    because the pair (state, weight) has the density of the target from the first step on, and the chain keeps it.
    There is no start-up bias at all; the price is a factor I(x) that varies between runs. Choosing x from N draws in
-   proportion to I, with the mean of their importances as the weight, is unbiased too and varies less. The paper's
-   alpha_i in proportion to I(x_i) is the same choice without the weight, which leaves a bias of the order 1/N. If all
-   draws are dark, the weight is 0, and so is the estimate: that, too, belongs to the mean.
+   proportion to I, with the mean of their importances as the weight, is unbiased too and varies less. To take the
+   alpha_i of eq 4.5 in proportion to I(x_i) is the same choice without the weight, which leaves a bias of the order
+   1/N. If all draws are dark, the weight is 0, and so is the estimate: that, too, belongs to the mean.
 
    The candidates pass by once: each replaces the one kept so far with probability W_i / (W_1 + ... + W_i), which
    leaves each in the end with probability proportional to W_i (Chao 1982). The importances are used in units of the
@@ -2813,8 +2867,9 @@ METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t can
 
 /* # 4.7 Burn-in and the normalisation
 
-   A burn-in throws the first samples away. Whether that pays is measured in chapter 5 and in the example `startup`:
-   it removes bias and variance's samples alike.
+   A burn-in throws the first samples away. That lowers the bias, and it raises the variance, since fewer samples are
+   left to average. Which wins is computed in section 5.18 for constant importance, and measured in the example
+   `startup`.
 
    [figure: startup.svg | All start-up policies at equal cost: squared bias and variance of a small picture against
    the evaluations spent.]
@@ -2913,8 +2968,8 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
 
        E_n^2 = p_{2n}(0) - 1                                                          (5.8)
 
-   This holds for any reversible chain, with p_{2n}(x_0 -> x_0)/pi(x_0) in place of p_{2n}(0) (chapter 6), and it is
-   the key to this chapter. Everything below is a value of
+   With the norm weighted by 1/pi (eq 6.8), and p_{2n}(x_0 -> x_0)/pi(x_0) in place of p_{2n}(0), this holds for any
+   reversible chain (chapter 6), and it is the key to this chapter. Everything below is a value of
 
        e_s(x) = p_s(x) - 1                                                            (5.9)
 
@@ -2990,7 +3045,6 @@ static void metroi_scaled_add(metroi_scaled *sum, double factor, double logarith
    under 1e-18 at 300 for every s >= 2. */
 
 #define METROI_MODES 300
-#define METROI_SMOOTH_KAPPA 1000.0
 
 typedef struct {
     metro_kernel kernel;
@@ -3005,7 +3059,7 @@ static void metroi_spectrum_make(const metro_kernel *k, double period, metroi_sp
     spectrum->kernel.large = 0;
     spectrum->period = period;
     spectrum->known = 0;
-    if (k->shape == METRO_VON_MISES && k->size < METROI_SMOOTH_KAPPA) {
+    if (k->shape == METRO_VON_MISES && k->size < METROI_DEBYE) {
         spectrum->known = METROI_MODES;
         metroi_von_mises_logs(k->size, METROI_MODES, spectrum->log_value);
     }
@@ -3020,7 +3074,7 @@ static double metroi_spectrum_log(const metroi_spectrum *spectrum, double k, int
     case METRO_GAUSSIAN: return -2 * (METROI_PI * size * f) * (METROI_PI * size * f);
     case METRO_CAUCHY: return -2 * METROI_PI * size * f;
     case METRO_VON_MISES:
-        if (size >= METROI_SMOOTH_KAPPA) return metroi_bessel_log(0, f, size);
+        if (size >= METROI_DEBYE) return metroi_bessel_log(0, f, size);
         return k <= (double)spectrum->known ? spectrum->log_value[(size_t)k - 1] : -METROI_INFINITY;
     case METRO_UNIFORM:
     case METRO_TRIANGLE:
@@ -3195,7 +3249,7 @@ static double metroi_reach(const metro_kernel *k, double s)
     case METRO_UNIFORM: return c * (s < 34 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
     case METRO_TRIANGLE: return 0.5 * c * (s < 17 ? s : 0.5 + sqrt(16 * s));
     case METRO_GAUSSIAN: return 9 * c * sqrt(s);
-    case METRO_VON_MISES: return c < METROI_SMOOTH_KAPPA ? METROI_INFINITY : 9 * sqrt(s / c) / (2 * METROI_PI);
+    case METRO_VON_MISES: return c < METROI_DEBYE ? METROI_INFINITY : 9 * sqrt(s / c) / (2 * METROI_PI);
     case METRO_KELEMEN: return c * (s < 146 ? s : 1 + 12 * sqrt(s));
     case METRO_CAUCHY: break;
     }
@@ -3549,9 +3603,10 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
    so says eq 5.31; the printed form says .022252. (The x that it leaves inside is harmless, since the modulus removes
    it.)
 
-   N seeds at equal distances with equal weights leave only the multiples of N: all other A_k vanish. More a set of
-   seeds cannot do. It starts the chain better; it makes it forget no faster. To see such zeros the sums over seeds
-   must reduce k x_i exactly (eq 3.2): 1e-16 that is left of A_1 survives where P*(N)^n does not.
+   N seeds at equal distances with equal weights leave only the multiples of N: all other A_k vanish. No other set of
+   N points does better. But unless the seeds cancel the slow modes exactly, what is left of the first mode fades by
+   P*(1) a step as before: seeds start the chain better, they do not make it forget faster. To see such zeros the sums
+   over seeds must reduce k x_i exactly (eq 3.2): 1e-16 that is left of A_1 survives where P*(N)^n does not.
 
    [figure: seeds.svg | The corrected formula for several seeds, the printed one, and what chains do.] */
 
@@ -3585,15 +3640,11 @@ static double metroi_seed_power(const metroi_seeds *seeds, double k)
 /* Seeds as a user gives them: some, all finite, with weights that are not negative and sum to 1. */
 static int metroi_seeds_valid(const metroi_seeds *seeds)
 {
-    double sum = 0;
     size_t i;
-    if (seeds->point == NULL || seeds->count == 0) return 0;
-    for (i = 0; i < seeds->count; i++) {
-        double alpha = metroi_seed_weight(seeds, i);
-        if (!isfinite(seeds->point[i]) || !(alpha >= 0)) return 0;
-        sum += alpha;
-    }
-    return fabs(sum - 1) <= 1e-9;
+    if (seeds->point == NULL || !metroi_weights_valid(seeds->alpha, seeds->count)) return 0;
+    for (i = 0; i < seeds->count; i++)
+        if (!isfinite(seeds->point[i])) return 0;
+    return 1;
 }
 
 /* The distance of two points on the circle, 0 .. 1/2. */
@@ -3759,8 +3810,9 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
 
    A step that perturbs only one coordinate, picked at random, is another matter. Its eigenvalues are 1 - (1/d) sum_j
    (1 - P*(k_j)), and with probability (1 - 1/d)^n a given coordinate has not been touched after n steps: p_n keeps a
-   part that is concentrated on a line, and for d >= 2 its L2 error is infinite for every n. Taking the coordinates in
-   turn makes it finite after a full sweep. The library computes neither.
+   part that is concentrated where that coordinate still has its first value, a set without volume, and for d >= 2 its
+   L2 error is infinite for every n. Taking the coordinates in turn makes it finite after a full sweep. The library
+   computes neither.
 
    [figure: fig2_dimensions.svg | The start-up error in one, two, three and five dimensions.] */
 
@@ -4131,7 +4183,7 @@ static int metroi_startup_two_valued(const metro_kernel *k, uint64_t n)
     return metroi_kernel_valid(k) && k->shape == METRO_UNIFORM && n == 1;
 }
 
-METRO_API double metro_startup_total_variation(const metro_kernel *k, uint64_t n)
+METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n)
 {
     double f = k->size - floor(k->size), e;
     if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.48 */
@@ -4139,7 +4191,7 @@ METRO_API double metro_startup_total_variation(const metro_kernel *k, uint64_t n
     return e > 2 ? 1 : 0.5 * e; /* eq 5.46 */
 }
 
-METRO_API double metro_startup_divergence(const metro_kernel *k, uint64_t n)
+METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n)
 {
     double f = k->size - floor(k->size), q = 1 - k->large, e;
     if (metroi_startup_two_valued(k, n)) {
@@ -4150,9 +4202,9 @@ METRO_API double metro_startup_divergence(const metro_kernel *k, uint64_t n)
     return log1p(e * e); /* eq 5.47 */
 }
 
+#undef METROI_DEBYE
 #undef METROI_MODES
 #undef METROI_PATIENCE
-#undef METROI_SMOOTH_KAPPA
 #undef METROI_SPLINE_ORDER
 #undef METROI_WIDEST
 
@@ -4225,7 +4277,7 @@ static double metroi_cone_series(double f, double n)
     double bound = log(1.16 * 2 * sqrt(2 / METROI_PI)) - 0.75 * log(4 * f * (1 - f));
     for (l = 2;; l++) {
         metroi_cone_next(&cone);
-        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n);
+        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n); /* eq 5.50 */
         if (fmod(l, 16) > 0) continue;
         tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.54 */
         if (cone.gap < 0.7) {
@@ -4798,8 +4850,10 @@ METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t b
    Small steps correlate neighbours, and large ones land independently; so far the paper. But at constant importance
    the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.65 is smallest where
    P*(1) is most negative, at tan(pi Delta) = pi Delta, Delta = 1.4302966531242: neighbours then tend to lie on
-   opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples, where Delta
-   = .1 has 121 times it. Every other importance than the constant one pulls the best size down (chapter 6).
+   opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples; at Delta =
+   .1 it is 121 times that of independent samples. Other importances move the best size either way (chapter 6): for a
+   picture of two pixels 1 + .9 cos(2 pi x) asks for a larger one than the constant does, a narrow peak for a much
+   smaller one.
 
    [figure: size.svg | Mean squared error, squared bias and variance against the size of the perturbation.]
 
@@ -4948,9 +5002,10 @@ METRO_API metro_result metro_startup_best_size(metro_shape shape, uint64_t burn,
 
        w_m = frac{1}{Delta N} int_{m - Delta N / 2}^{m + Delta N / 2} max(0, 1 - abs(t)) dt                  (6.1)
 
-   (This is the matrix that Galerkin's method with constant elements gives, so the errors of what we compute fall with
-   1/N^2. The simpler choice, the share of the kernel that lies over cell m when it starts from the middle of a cell,
-   converges as fast on average but jumps whenever an end of the kernel passes from one cell to the next.)
+   (This is the matrix that Galerkin's method with constant elements gives, so the errors of the gap, the total
+   variation and the mean squared error fall with 1/N^2; the L2 norm is another matter, section 6.3. The simpler
+   choice, the share of the kernel that lies over cell m when it starts from the middle of a cell, converges as fast
+   on average but jumps whenever an end of the kernel passes from one cell to the next.)
 
    The difference of two integrals of the hat loses digits where both are near 1, so we integrate from the other end:
    H(x) is what the hat has beyond x, and $w_m = (H(abs(m) - Delta N/2) - H(abs(m) + Delta N/2)) / (Delta N)$. */
@@ -5809,10 +5864,10 @@ METRO_API double metro_exponential_best_size(double lambda, int reflecting)
 
 /* # 6.7 The best size
 
-   "The ultimate goal is to provide estimates for an optimal perturbation size", the paper says last. We can say which
-   size has the least error, if we say of what. Let a run of M steps estimate the mean of an integrand f over the
-   stationary distribution: how bright a pixel is, say. A chain records the state in which each step ends (chapter 4),
-   so this is the mean of M samples after a burn-in of one step, $V = P V_M$ in the terms of section 6.5. Its mean
+   "The ultimate goal is to provide estimates for an 'optimal' perturbation size", the paper says last. We can say
+   which size has the least error, if we say of what. Let a run of M steps estimate the mean of an integrand f over
+   the stationary distribution: how bright a pixel is, say. A chain records the state in which each step ends (chapter
+   4), so this is the mean of M samples after a burn-in of one step, $V = P V_M$ in the terms of section 6.5. Its mean
    squared error is
 
        E_M^2(Delta) = "bias"^2 + "variance" = frac{1}{N} sum_{i} frac{V(i)}{M^2}                             (6.26)
@@ -5824,10 +5879,10 @@ METRO_API double metro_exponential_best_size(double lambda, int reflecting)
 
    Why not something simpler? The rules of thumb all look at a part of the question, and each has an importance on
    which it fails. The largest gap chases the slowest mode whether f has any of it or not. An acceptance rate of .44,
-   which is right for a normal target on a long line, picks a size that stays on its island when there are two. The
-   largest mean jump likes big steps and overlooks a narrow peak. The error sees all of it, since it is what we want.
-   The tests hold the choice to an efficiency of at least .95: the least error of any size, computed on four times as
-   many cells, over the error of the chosen one.
+   which is right for a normal target on a long line (Gelman, Roberts and Gilks 1996), picks a size that stays on its
+   island when there are two. The largest mean jump likes big steps and overlooks a narrow peak. The error sees all of
+   it, since it is what we want. The tests hold the choice to an efficiency of at least .95: the least error of any
+   size, computed on four times as many cells, over the error of the chosen one.
 
    A program that is about to sample asks first:
 
@@ -5942,7 +5997,7 @@ static metro_result metroi_pilot_try(const metroi_pilot *pilot, double size, met
 }
 
 /* As a function of the size the error may have several valleys - one for steps within a peak, one for steps from peak
-   to peak - so the search first looks everywhere. Up to half the domain the sizes grow by factors of about 1.4;
+   to peak - so the search first looks everywhere. Up to half the domain the sizes grow by factors of about 1.5;
    beyond, where islands are as far apart as a step is long, in equal steps. It ends at 2, where proposals are
    independent as they are at 1: sizes beyond 2 only repeat what lies between, with smaller swings. Two rounds of
    halving then close in on the best one. Sizes are tried from the largest to the smallest, so that among equals, as
@@ -6630,7 +6685,7 @@ METRO_API double metro_squared_jump(const double *draw, size_t draws, double per
    bias. For a picture each is averaged over its values.
 
    How far off are they? The values of one run depend on each other, the runs do not, so the unit is the run. The
-   jackknife leaves out one run at a time and looks at how the answer theta moves (Efron and Stein 1981):
+   jackknife leaves out one run at a time and looks at how the answer theta moves (Tukey 1958):
 
        "error"^2 = frac{R - 1}{R} sum_{r=1}^{R} (theta_r - frac{1}{R} sum_{q=1}^{R} theta_q)^2               (7.14)
 
@@ -6638,8 +6693,8 @@ METRO_API double metro_squared_jump(const double *draw, size_t draws, double per
    is smaller by $e_r^2 R/(R - 1)$; nothing has to be summed again. For the mean squared error eq 7.14 is the usual
    error of a mean.
 
-   The jackknife errs upwards, and for b^2 where there is no bias, and b^2 is all products of two runs, it is too
-   large by the factor sqrt(2 (R - 1)/(R - 2)). */
+   The jackknife errs upwards (Efron and Stein 1981), and for b^2 where there is no bias, and b^2 is all products of
+   two runs, it is too large by the factor sqrt(2 (R - 1)/(R - 2)). */
 
 /* Adds what one value says of bias^2, variance and mean squared error to `total`, and of each without one of the runs
    to `left_out`. `value` is the value in the first run, and `stride` numbers on it stands in the next. What too few
@@ -7872,9 +7927,9 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    | paper (18) | eq 7.1 | the sum runs to M - 1 with weights 1 - k/M, holds in stationarity, and gives a standard deviation | `metro_bernstein` |
    | paper (19) | none | none: the transport of light by bundles of rays is not part of these chapters | none |
 
-   The printed algorithm of section 1.1 has the transition probabilities of its quotient exchanged: eq 4.2. Section
-   2.3 asks for many more mutations than 1/Delta; diffusion needs many more than 1/Delta^2: eq 5.18. The apex angle of
-   section 3.2 is the full angle of a cone, twice the half-angle of `metro_cone_perturb`.
+   The printed algorithm of paper 1.1 has T(i -> t) in the numerator where T(t -> i) belongs, so that T cancels: eq
+   4.2. By paper 2.3 the mutations should be many more than 1/Delta; diffusion needs many more than 1/Delta^2: eq
+   5.18. The apex angle of paper 3.2 is the full angle of a cone, twice the half-angle of `metro_cone_perturb`.
 
    # B Symbols
 

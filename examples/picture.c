@@ -156,7 +156,7 @@ static int hang(plot_chart *sheet, int row, int column, const metro_image *image
 int main(int argc, char **argv)
 {
     static const double full[LOOKS] = { 0.25, 1, 4, 16, 64 };
-    plot_chart chart = plot_chart_make("Small steps paint wrong spots; a few large ones cure them",
+    plot_chart chart = plot_chart_make("Small steps paint wrong spots; larger ones, or a few uniform ones, do not",
                                        "Relative error of the picture against mutations per pixel: one chain for each way, from the "
                                        "same dark corner. Independent samples would fall with slope -1/2.");
     plot_csv csv = plot_csv_open("out/picture.csv", "way,size,large_step,mutations_per_pixel,relative_rmse");
@@ -169,7 +169,7 @@ int main(int argc, char **argv)
     metro_result result = METRO_OK;
     int w, look;
     if (argc > 1 && metro_image_load(argv[1], &picture, message, sizeof message) != METRO_OK) {
-        fprintf(stderr, "picture: %s: %s\n", argv[1], message);
+        fprintf(stderr, "picture: %s\n", message);
         return 1;
     }
     memset(painted, 0, sizeof painted);
@@ -179,6 +179,9 @@ int main(int argc, char **argv)
     sheet.rows = WAYS;
     sheet.columns = LOOKS + 1;
     sheet.width = 1400;
+    printf("relative RMS error after so many mutations a pixel:\n%-32s", "");
+    for (look = 0; look < LOOKS; look++) printf(" %7.4g", full[look]);
+    printf("\n");
     for (w = 0; w < WAYS && result == METRO_OK; w++) {
         result = paint(&picture, &ways[w], full, painted, error[w]);
         printf("%-32s", ways[w].name);

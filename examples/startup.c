@@ -176,6 +176,11 @@ int main(void)
         chart.panel[i].x_label = "evaluations of the importance";
         chart.panel[i].y_label = "relative to the power of the picture";
     }
+    printf("evaluations:        ");
+    for (b = 0; b < BUDGETS; b++) printf("  %-28d", (int)budget[b]);
+    printf("\nstart-up            ");
+    for (b = 0; b < BUDGETS; b++) printf("  %-19s %8s", "bias^2", "variance");
+    printf("\n");
     for (policy = 0; policy < POLICIES; policy++) {
         printf("%-20s", policy_name[policy]);
         for (b = 0; b < BUDGETS; b++) {
