@@ -2496,8 +2496,11 @@ METRO_API double metro_vmf_coefficient(double kappa, int degree)
 
 static double metroi_acceptance(double current, double tentative, double ratio)
 {
-    double quotient = tentative / current, a = quotient * ratio;
+    double quotient, a;
+    if (ratio == 1) return tentative < current ? tentative / current : 1; /* nothing can overflow */
     if (!(tentative > 0) || !(ratio > 0)) return 0;
+    quotient = tentative / current;
+    a = quotient * ratio;
     if (!(quotient > 1e-290 && quotient < 1e290 && a > 1e-290 && a < 1e290))
         a = exp(log(tentative) - log(current) + log(ratio));
     return a < 1 ? a : 1; /* eq 4.2 */
