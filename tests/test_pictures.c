@@ -3,6 +3,9 @@
    The bytes of the files are written out by hand here, and the library must agree with them in both directions. All
    memory goes through a counter that can also fail: it shows what a refused file costs and that nothing leaks. */
 
+#ifndef _POSIX_C_SOURCE
+#define _POSIX_C_SOURCE 200809L /* fork, kill, symlink */
+#endif
 #include <stddef.h>
 #include <stdlib.h>
 
@@ -53,7 +56,10 @@ static void *memory_resize(void *block, size_t size)
 #include <process.h>
 #define getpid _getpid
 #else
+#include <signal.h>
 #include <sys/types.h>
+#include <sys/wait.h>
+#include <time.h>
 #include <unistd.h>
 #endif
 
@@ -925,6 +931,39 @@ static void nothing_leaked(void)
     CHECK(memory_global.living == 0, "%d blocks are still alive", (int)memory_global.living);
 }
 
+/* A program that writes the same file over and over is killed at some moment. Catches: a picture written in place, of
+   which half would be there. */
+static void killed_run(void)
+{
+#ifndef _WIN32
+    metro_image image = random_picture(150, 100, 3), read = nothing();
+    char path[300], sibling[310], message[200];
+    int k;
+    snprintf(path, sizeof path, "%s", scratch("killed.pfm"));
+    snprintf(sibling, sizeof sibling, "%s.tmp", path);
+    for (k = 0; k < 12; k++) {
+        struct timespec pause = { 0, 3000000 + 700000 * k };
+        pid_t child;
+        CHECK(metro_image_save_pfm(&image, path) == METRO_OK, "cannot write %s", path);
+        fflush(NULL);
+        child = fork();
+        if (child == 0)
+            for (;;) metro_image_save_pfm(&image, path);
+        CHECK(child > 0, "cannot fork");
+        if (child <= 0) break;
+        nanosleep(&pause, NULL);
+        kill(child, SIGKILL);
+        waitpid(child, NULL, 0);
+        CHECK(metro_image_load(path, &read, message, sizeof message) == METRO_OK, "after %d: %s", k, message);
+        CHECK(read.width == 150 && read.height == 100, "another picture");
+        metro_image_free(&read);
+        remove(sibling);
+    }
+    remove(path);
+    metro_image_free(&image);
+#endif
+}
+
 int main(void)
 {
     (void)memory_resize; /* for the header's chapters that grow a block */
@@ -943,6 +982,7 @@ int main(void)
     CHECK_RUN(refuses_to_write);
     CHECK_RUN(unwritable);
     CHECK_RUN(full_disk);
+    CHECK_RUN(killed_run);
     CHECK_RUN(devices);
     CHECK_RUN(replaces);
     CHECK_RUN(every_allocation_fails);
