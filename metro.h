@@ -251,7 +251,7 @@ typedef struct metro_rng {
 } metro_rng;
 
 /* A stream for (seed, stream). Streams of different pairs start at unrelated places of a period of 2^256 - 1.
-   Cost: some 10 ns. Source: xoshiro256++ (Blackman and Vigna 2021), its state filled by SplitMix64. */
+   Cost: 16 hashes of 64 bits. Source: xoshiro256++ (Blackman and Vigna 2021), its state filled by SplitMix64. */
 METRO_API metro_rng metro_rng_make(uint64_t seed, uint64_t stream);
 
 /* The next 64 random bits. */
@@ -329,20 +329,20 @@ typedef struct {
 /* Perturbs `x` on the circle of length 1 and returns the new point, always in [0, 1); any finite `x` is taken modulo
    1. NaN when the kernel is invalid or `x` is not finite (random numbers may be used up then). While `large` is 0
    nothing is drawn for it: METRO_UNIFORM is x + size * (metro_rng_uniform(rng) - 0.5), wrapped. A step of over 2^32
-   turns ends at a uniform point. Cost: 3 ns beside its random numbers for METRO_UNIFORM, up to 100 ns for the others.
-   Source: Best and Fisher (1979) for METRO_VON_MISES, Kelemen et al. (2002) for METRO_KELEMEN, inversion
-   elsewhere. */
+   turns ends at a uniform point. Cost: one random number for METRO_UNIFORM, METRO_CAUCHY and METRO_KELEMEN, two for
+   METRO_TRIANGLE and METRO_GAUSSIAN, three a try for METRO_VON_MISES; one more if `large` > 0. Source: Best and
+   Fisher (1979) for METRO_VON_MISES, Kelemen et al. (2002) for METRO_KELEMEN, inversion elsewhere. */
 METRO_API double metro_kernel_perturb(const metro_kernel *k, double x, metro_rng *rng);
 
 /* The density, per unit length of the circle, of the perturbation that goes from `from` to `to`: wrapped, with the
    large steps in it. The same, to the last bit, from `to` to `from`. At a jump (UNIFORM, KELEMEN) the mean of both
    sides. KELEMEN with size_min == size has two atoms: +INFINITY there, 0 elsewhere (plus `large`). NaN when the
-   kernel is invalid or a point is not finite. Cost: under a microsecond. */
+   kernel is invalid or a point is not finite. Cost: at most some 70 divisions or 20 exponentials. */
 METRO_API double metro_kernel_density(const metro_kernel *k, double from, double to);
 
 /* The Fourier coefficient P*(harmonic) of the kernel on the circle, paper (17) for METRO_UNIFORM: a real number, even
    in `harmonic`, 1 at 0. NaN when the kernel is invalid. Absolute error below 1e-15 for harmonics to 1e6 and more;
-   zeros are exact. Cost: 20 ns; METRO_VON_MISES and METRO_KELEMEN: up to some microseconds. */
+   zeros are exact. Cost: a sine or an exponential; METRO_VON_MISES and METRO_KELEMEN: at most some 2000 terms. */
 METRO_API double metro_kernel_coefficient(const metro_kernel *k, long harmonic);
 
 /* The same three on the interval [0, 1] whose ends reflect: a point beyond an end comes back as far as it went over.
@@ -357,7 +357,7 @@ METRO_API double metro_kernel_reflect_coefficient(const metro_kernel *k, long ha
 /* A uniform direction of the cone around `from` (length 1) whose sides stand `half_angle` radians off its axis: the
    apex angle of the paper's section 3.2 is twice that. From pi on the cone is the whole sphere. The result has length
    1 to the last digits, however often it is perturbed. NaN components when `half_angle` is not positive and finite or
-   `from` is not of length 1 (its square off by over a per cent). Two random numbers, some 60 ns. Source: Archimedes;
+   `from` is not of length 1 (its square off by over a per cent). Cost: two random numbers. Source: Archimedes;
    the frame is that of Duff et al. (2017). */
 METRO_API metro_vec3 metro_cone_perturb(double half_angle, metro_vec3 from, metro_rng *rng);
 
@@ -367,13 +367,14 @@ METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_ve
 
 /* The eigenvalue lambda_l of the spherical harmonics of degree l = `degree` under the cone of `half_angle` radians.
    NaN when `half_angle` is not positive and finite or `degree` is negative. Absolute error about 1e-15 at degree 1000
-   and 1e-14 at 1e5. Cost: some 10 ns times the degree. */
+   and 1e-14 at 1e5. Cost: `degree` steps of a recurrence. */
 METRO_API double metro_cone_coefficient(double half_angle, int degree);
 
 /* The von Mises-Fisher kernel exp(kappa cos theta) on the sphere, theta the angle from the unit vector `from`: drawn,
    as a density per steradian, and its eigenvalue of degree `degree`. kappa = 0 is the uniform direction; NaN when
    kappa is negative or not finite, `degree` is negative, or (drawn only) `from` is not of length 1. Cost: two random
-   numbers and some 60 ns; the coefficient at most 10 us. Source: Ulrich (1984) in the stable form of Jakob (2012). */
+   numbers; the coefficient at most some 2000 steps of a recurrence. Source: Ulrich (1984) in the stable form of Jakob
+   (2012). */
 METRO_API metro_vec3 metro_vmf_perturb(double kappa, metro_vec3 from, metro_rng *rng);
 METRO_API double metro_vmf_density(double kappa, metro_vec3 from, metro_vec3 to);
 METRO_API double metro_vmf_coefficient(double kappa, int degree);
@@ -564,8 +565,9 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error);
    would not give that, which is for C above some thousands: sizes that are tiny beside the circle or close to each
    other. Lengths below 1e-100 give NaN, and METRO_KELEMEN of sizes above 10000 at n = 1. */
 
-/* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: 0.1 to 2 microseconds for every n
-   and size, METRO_VON_MISES 15 (METRO_KELEMEN: up to 0.6 ms at n = 2 and 20 ms at n = 3, falling fast from there). */
+/* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: at most some 35 modes for every n
+   and size, METRO_VON_MISES 300 (METRO_KELEMEN: up to some 60000 terms at n = 2 and 3, falling from there); `make
+   bench` says what that takes. */
 METRO_API double metro_startup_error(const metro_kernel *k, uint64_t n);
 METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
 
@@ -574,9 +576,9 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
    NULL or `seeds` is 0, when a seed is not finite, when a weight is negative or not finite, and when the weights do
    not sum to 1 within 1e-9. Where seeds cancel modes (equispaced ones) the error is small against that of one seed,
    and is known to 1e-13 of the latter, to 1e-8 for n <= 2; the logarithm is -INFINITY when nothing is left. Cost: for
-   n >= 3 proportional to `seeds`, some 80 ns times a number of modes that is about 150/size at n = 3 and 1/size from
-   n = 10 on; for n <= 2 (METRO_TRIANGLE: n = 1) and for seeds much farther apart than the chain has gone,
-   proportional to seeds^2 but without the modes. */
+   n >= 3 proportional to `seeds`, one sine and cosine a seed for each of a number of modes that is about 150/size at
+   n = 3 and 1/size from n = 10 on; for n <= 2 (METRO_TRIANGLE: n = 1) and for seeds much farther apart than the chain
+   has gone, proportional to seeds^2 but without the modes. */
 METRO_API double metro_startup_error_seeds(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha,
                                            size_t seeds);
 METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n, const double *seed,
@@ -584,8 +586,8 @@ METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n
 
 /* The error of the running mean (p_burn + .. + p_{burn+steps-1})/steps, which is the density that a sample picked at
    random among `steps` samples after a burn-in has; one seed; eq 5.38. burn = 0 includes p_0: +INFINITY. steps = 0:
-   NaN. Cost: at most 50 microseconds while burn + steps <= 1000 (METRO_KELEMEN: up to 25 ms); for tiny sizes it grows
-   with the square root of `steps`, to 20 ms at most for sizes from 1e-6. */
+   NaN. Cost: at most some 400 modes while burn + steps <= 1000 (METRO_KELEMEN: some 90000); for tiny sizes it grows
+   with the square root of `steps`. */
 METRO_API double metro_startup_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 
@@ -594,8 +596,8 @@ METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t bu
    a jump the mean of both sides. NaN for the arguments that give NaN there, for an `x` that is not finite, and for
    METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density, or of a size above 10000 at n = 2
    and 3. The error is below 1e-13 of the largest value of p_n (METRO_KELEMEN from n = 5 on: 1e-12 while C is below
-   50, else as above). Cost: 0.1 to 2 microseconds a seed, METRO_VON_MISES 12; METRO_KELEMEN: 0.2 ms at n = 3 and 4,
-   15 ms at n = 5, less beyond. */
+   50, else as above). Cost: at most some 70 modes a seed, METRO_VON_MISES 300; METRO_KELEMEN: up to some 100000 terms
+   from n = 3 on. */
 METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
                                        const double *alpha, size_t seeds);
 
@@ -625,13 +627,13 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
    distance of the densities per steradian divide by sqrt(4 pi)), eq 5.50. And its natural logarithm, finite where the
    error underflows; -INFINITY means that the error is exactly 0. n = 0 gives +INFINITY; from `half_angle` pi on and n
    >= 1 the error is exactly 0. NaN when `half_angle` is not positive and finite. Relative error 1e-12, or 1e-12 of
-   the logarithm where that is larger. Cost: under 50 microseconds for every n and angle. The half angle is half the
-   apex angle of the paper's section 3.2. */
+   the logarithm where that is larger. Cost: at most some 4000 degrees for every n and angle. The half angle is half
+   the apex angle of the paper's section 3.2. */
 METRO_API double metro_cone_startup_error(double half_angle, uint64_t n);
 METRO_API double metro_cone_startup_log_error(double half_angle, uint64_t n);
 
 /* The same for the von Mises-Fisher kernel of concentration `kappa`; kappa = 0 is the uniform direction. NaN when
-   kappa is negative or not finite. Cost: under 50 microseconds. */
+   kappa is negative or not finite. Cost: at most some 1000 degrees. */
 METRO_API double metro_vmf_startup_error(double kappa, uint64_t n);
 METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n);
 
@@ -654,8 +656,9 @@ typedef struct {
    * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite, seeds or weights that
    metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is untouched then.
    Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0 is exactly 0.
-   Cost: some 0.1 us for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`, and 5 ns for
-   each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a pair. */
+   Cost: at most two joins (eq 5.61) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
+   and some multiplications for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a
+   pair. */
 METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
                                                const double *cosine, const double *sine, size_t harmonics,
                                                const double *seed, const double *alpha, size_t seeds,
@@ -795,8 +798,8 @@ typedef struct {
    for steps = 0, an integrand that is not finite where it is asked (or whose square is not), or a start outside [0,
    1); METRO_ERROR_DARK_SEED or METRO_ERROR_BAD_SEED for a start of zero or of negative, infinite or NaN importance;
    METRO_ERROR_NO_IMPORTANCE if all 64 points are dark; METRO_ERROR_MEMORY; on failure `best` is unchanged. Cost: 64
-   calls of each function and some 10 to 100 ms of arithmetic, whatever `steps`. A feature narrower than 1/64 is seen
-   by one point or by none, and the prediction is as good as the points. */
+   calls of each function and some twenty operators of 64 cells, whatever `steps`. A feature narrower than 1/64 is
+   seen by one point or by none, and the prediction is as good as the points. */
 METRO_API metro_result metro_best_size(double (*importance)(double x, void *user), void *user, uint64_t steps,
                                        const metro_best_options *options, metro_best *best);
 
@@ -1009,7 +1012,7 @@ typedef struct {
 /* Compares `image` with `reference`, which has the same size and channels. A NaN or an infinity in either picture
    makes the sums NaN or infinite, as it must; one NaN and `largest` is NaN and names its pixel. A black reference
    gives infinity, or NaN where the picture is black too. Returns METRO_ERROR_ARGUMENT when the pictures differ in
-   shape, are empty or NULL, and then `difference` is unchanged. Cost: some 20 ns a pixel. */
+   shape, are empty or NULL, and then `difference` is unchanged. Cost: linear. */
 METRO_API metro_result metro_image_error(const metro_image *image, const metro_image *reference,
                                          metro_image_difference *difference);
 
@@ -2099,7 +2102,7 @@ static void metroi_bessel_logs(double order, double first_gap, double kappa, siz
 }
 
 /* ln P*(j) for j = 1 .. count: von Mises, and von Mises-Fisher on the sphere (there delta_1 = 1/kappa - 2/(e^{2
-   kappa} - 1)). -inf where kappa is 0. Cost: some 20 ns a value. */
+   kappa} - 1)). -inf where kappa is 0. */
 
 static void metroi_von_mises_logs(double kappa, size_t count, double *log_value)
 {
@@ -2903,9 +2906,8 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
     return metro_moments_mean(&chain->normalisation);
 }
 
-/* Chapters 5 to 8 are compiled at -O1 by gcc, where it would use more. That saves a third of the time that a lesson
-   takes to compile, and no time that `make bench` measures changes. What is compiled without optimization stays so.
-   */
+/* A lesson is compiled more often than it is run for long, so gcc is held to -O1 in chapters 5 to 8, where it would
+   do more: `make bench` finds them no slower. What is compiled without optimization stays so. */
 
 #if defined(__GNUC__) && !defined(__clang__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
 #define METROI_COMPILE_FAST
