@@ -656,7 +656,7 @@ typedef struct {
    * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite, seeds or weights that
    metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is untouched then.
    Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0 is exactly 0.
-   Cost: at most two joins (eq 5.61) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
+   Cost: at most two joins (eq 5.62) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
    and some multiplications for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a
    pair. */
 METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
