@@ -13,6 +13,8 @@ mkdir -p build/book2 build/docs
 $weave metro.h out build/book2 --tests tests --lectures docs > /dev/null
 diff -r out/book build/book2 > /dev/null || { echo "weaving twice gives two books" >&2; exit 1; }
 $weave metro.h out out/book --extract build/docs > /dev/null
+awk '/^```c$/ { on = 1; next } /^```$/ { if (on) exit } on' README.md | cmp -s - examples/hello.c ||
+    { echo "README does not show examples/hello.c as it is" >&2; exit 1; }
 count=0
 for program in build/docs/*.c; do
     [ -f "$program" ] || continue

@@ -1,5 +1,5 @@
-/* hello.c: does a chain still know where it started? The theory says how far its density is from uniform (0 is forgotten),
-   the experiment how many of 20000 chains are in the quarter of the circle around the seed (25 % is forgotten). */
+/* hello.c: does a chain still know where it started? The theory says how far its density is from uniform (0 is
+   forgotten), the experiment how many of 20000 chains are in the quarter around the seed (25 % is forgotten). */
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 
@@ -14,6 +14,7 @@ int main(void)
             for (uint64_t i = 0; i < n; i++) x = metro_kernel_perturb(&kernel, x, &rng);
             near += x < 0.125 || x > 0.875;
         }
-        printf("%4d steps: error %.4f, %.1f %% near the seed\n", (int)n, metro_startup_error(&kernel, n), near / 200.0);
+        printf("%4d steps: error %.4f, %.1f %% near the seed\n", (int)n, metro_startup_error(&kernel, n),
+               near / 200.0);
     }
 }

@@ -1,11 +1,13 @@
-/* own.c: a researcher's template: your own target, your own asymmetric mutation, and the questions to ask before trusting it.
+/* own.c: a researcher's template: your own target, your own asymmetric mutation, and the questions to ask before
+   trusting it.
 
-   Replace three functions: `importance` (what you sample), `propose` (how you move, returning T(to -> from)/T(from -> to)) and
-   `record` (what you keep). The rest asks, in this order: Is the mutation in balance with its ratio? Do four chains from
-   four corners agree? How many independent draws are they worth? How good is b, and the mean?
+   Replace three functions: `importance` (what you sample), `propose` (how you move, returning T(to -> from)/T(from ->
+   to)) and `record` (what you keep). The rest asks, in this order: Is the mutation in balance with its ratio? Do four
+   chains from four corners agree? How many independent draws are they worth? How good is b, and the mean?
 
-   The target here is two-dimensional, a bent ridge on a unit square; the mutation drifts along the ridge, which makes it
-   asymmetric. Run it once with `own wrong`: the ratio is then left out, everything still runs, and the first question finds it.
+   The target here is two-dimensional, a bent ridge on a unit square; the mutation drifts along the ridge, which makes
+   it asymmetric. Run it once with `own wrong`: the ratio is then left out, everything still runs, and the first
+   question finds it.
 
    Writes out/own.svg (the chains on the ridge, R-hat as they go on) and out/own.csv. */
 
@@ -21,9 +23,9 @@ typedef struct {
 
 typedef struct {
     int forget_ratio;
-    double *draw;     /* [chain * draws + i]: the x of each step, for the diagnostics */
-    double *path;     /* the same of y */
-    metro_sum mean;   /* of x, with the weights of the chain */
+    double *draw;   /* [chain * draws + i]: the x of each step, for the diagnostics */
+    double *path;   /* the same of y */
+    metro_sum mean; /* of x, with the weights of the chain */
 } experiment;
 
 /* The importance: a ridge along y = 4 (x - 1/2)^2, brighter to the right. Any scale will do. */
@@ -41,8 +43,8 @@ static void record(const void *sample, double weight, void *user)
     metro_sum_add(&((experiment *)user)->mean, weight * ((const point *)sample)->x);
 }
 
-/* The mutation: a normal step around a point a little further along the slope of the ridge. Its density depends on where it
-   starts, so the way back has another one, and the ratio of the two goes into the acceptance (eq 4.2). */
+/* The mutation: a normal step around a point a little further along the slope of the ridge. Its density depends on
+   where it starts, so the way back has another one, and the ratio of the two goes into the acceptance (eq 4.2). */
 static const double step_size = 0.06;
 
 static double drift(double x) { return 0.02 * (x - 0.5); }
@@ -68,7 +70,8 @@ static int complain(const char *what, metro_result result)
 }
 
 /* Runs the chain of corner `c` and writes down where it is after each step. */
-static metro_result run_chain(const metro_target *target, int c, size_t draws, metro_moments *b, metro_chain_counts *counts)
+static metro_result run_chain(const metro_target *target, int c, size_t draws, metro_moments *b,
+                              metro_chain_counts *counts)
 {
     static const double corner[CHAINS][2] = { { 0.02, 0.92 }, { 0.98, 0.92 }, { 0.3, 0.2 }, { 0.6, 0.05 } };
     metro_chain_options options = { 0.05, 0 }; /* one step in twenty is a uniform draw: it also measures b */
@@ -94,15 +97,17 @@ static metro_result run_chain(const metro_target *target, int c, size_t draws, m
 static double rhat_so_far(const experiment *e, size_t draws, size_t length, double *scratch)
 {
     int c;
-    for (c = 0; c < CHAINS; c++) memcpy(scratch + (size_t)c * length, e->draw + (size_t)c * draws, length * sizeof *scratch);
+    for (c = 0; c < CHAINS; c++)
+        memcpy(scratch + (size_t)c * length, e->draw + (size_t)c * draws, length * sizeof *scratch);
     return metro_rhat(scratch, CHAINS, length);
 }
 
 static int draw_chart(const experiment *e, size_t draws)
 {
-    plot_chart chart = plot_chart_make("Four chains of one's own mutation",
-                                       "Left: the first 400 steps of each chain from its corner. Right: R-hat below 1.01 (dashed) "
-                                       "is what one asks for before trusting a result.");
+    plot_chart chart =
+        plot_chart_make("Four chains of one's own mutation",
+                        "Left: the first 400 steps of each chain from its corner. Right: R-hat below 1.01 (dashed) "
+                        "is what one asks for before trusting a result.");
     plot_csv csv = plot_csv_open("out/own.csv", "steps,rhat,ess");
     double length[LOOKS], rhat[LOOKS];
     double *scratch = (double *)malloc(CHAINS * draws * sizeof *scratch);
@@ -146,15 +151,17 @@ static int ask(const experiment *e, size_t draws, const metro_balance *balance, 
     printf("R-hat %.4f, bulk ESS %.0f and tail ESS %.0f of %.0f draws\n", metro_rhat(e->draw, CHAINS, draws), ess,
            metro_ess_tail(e->draw, CHAINS, draws), n);
     printf("b = %.5f +- %.5f\n", metro_moments_mean(b), metro_moments_error(b));
-    printf("the mean of x is %.4f +- %.4f, from draws worth %.0f independent ones%s%s\n", metro_sum_value(&e->mean) / n,
-           metro_mcse_mean(e->draw, CHAINS, draws), ess, trouble != NULL ? "; but: " : "", trouble != NULL ? trouble : "");
+    printf("the mean of x is %.4f +- %.4f, from draws worth %.0f independent ones%s%s\n",
+           metro_sum_value(&e->mean) / n, metro_mcse_mean(e->draw, CHAINS, draws), ess,
+           trouble != NULL ? "; but: " : "", trouble != NULL ? trouble : "");
     return balance->probability < 1e-6;
 }
 
 int main(int argc, char **argv)
 {
     /* The space: two intervals. Their kernels are not used, since the target proposes for itself. */
-    metro_axis axes[2] = { { METRO_INTERVAL, { METRO_UNIFORM, 1, 0, 0 } }, { METRO_INTERVAL, { METRO_UNIFORM, 1, 0, 0 } } };
+    metro_axis axes[2] = { { METRO_INTERVAL, { METRO_UNIFORM, 1, 0, 0 } },
+                           { METRO_INTERVAL, { METRO_UNIFORM, 1, 0, 0 } } };
     size_t draws = plot_quick() ? 4000 : 100000;
     experiment e;
     metro_target target;

@@ -1,13 +1,13 @@
 /* startup.c: all start-up policies side by side, at equal cost (section 1.2 and 2.1 of the paper).
 
-   The picture is 24 pixels round a circle: a bright peak on a dim floor. Each policy may evaluate the importance so many times
-   and must find everything with that, the normalisation b too, for which a fifth of the budget goes into independent
-   draws (weighted seeds and large steps draw them anyway). Every policy is repeated many times, and its squared bias and its
-   variance are taken apart.
+   The picture is 24 pixels round a circle: a bright peak on a dim floor. Each policy may evaluate the importance so
+   many times and must find everything with that, the normalisation b too, for which a fifth of the budget goes into
+   independent draws (weighted seeds and large steps draw them anyway). Every policy is repeated many times, and its
+   squared bias and its variance are taken apart.
 
-   See: the bias falls with the square of the budget, the variance with the budget itself, so a start that looks terrible at a
-   hundred samples is a footnote at ten thousand. A burn-in pays for its lost samples with variance. Weighted seeds
-   have no bias at any budget. Large steps cure the start and the slow walk at once.
+   See: the bias falls with the square of the budget, the variance with the budget itself, so a start that looks
+   terrible at a hundred samples is a footnote at ten thousand. A burn-in pays for its lost samples with variance.
+   Weighted seeds have no bias at any budget. Large steps cure the start and the slow walk at once.
 
    Writes out/startup.svg and out/startup.csv. */
 
@@ -17,9 +17,9 @@
 
 enum { PIXELS = 24, SEEDS = 16, POLICIES = 7, BUDGETS = 5, JOBS = 64 };
 
-static const char *const policy_name[POLICIES] = {
-    "one dark point", "burn-in", "16 fixed seeds", "seeds by importance", "weighted seed", "16 weighted seeds", "large steps"
-};
+static const char *const policy_name[POLICIES] = { "one dark point",      "burn-in",       "16 fixed seeds",
+                                                   "seeds by importance", "weighted seed", "16 weighted seeds",
+                                                   "large steps" };
 static const uint64_t budget[BUDGETS] = { 100, 400, 1600, 6400, 25600 };
 
 /* The importance is the brightness at x: a peak of width .04 at .7 on a floor. */
@@ -33,13 +33,17 @@ static double importance(const double *z, void *sample, void *user)
 }
 
 /* f/I is 1 on the pixel of the sample, so its weight is all there is to add. */
-static void record(const void *sample, double weight, void *user) { ((double *)user)[*(const int *)sample] += weight; }
+static void record(const void *sample, double weight, void *user)
+{
+    ((double *)user)[*(const int *)sample] += weight;
+}
 
 static void truth_of(double *pixel)
 {
     int i, k;
     for (i = 0; i < PIXELS; i++)
-        for (k = 0, pixel[i] = 0; k < 1000; k++) pixel[i] += brightness((i + (k + 0.5) / 1000) / PIXELS) / 1000 / PIXELS;
+        for (k = 0, pixel[i] = 0; k < 1000; k++)
+            pixel[i] += brightness((i + (k + 0.5) / 1000) / PIXELS) / 1000 / PIXELS;
 }
 
 /* Adds `scale` times the mean over the steps of a chain. */
@@ -156,9 +160,10 @@ static size_t repeats_for(uint64_t cost)
 int main(void)
 {
     double truth[PIXELS], power = 0, x[BUDGETS], bias2[BUDGETS], bias2_error[BUDGETS], variance[BUDGETS];
-    plot_chart chart = plot_chart_make("A bad start fades faster than the noise",
-                                       "Squared bias (left) and variance (right) of a 24-pixel picture, relative to its power, at "
-                                       "equal cost. Squared bias under two standard errors is not drawn: weighted seeds have none.");
+    plot_chart chart =
+        plot_chart_make("A bad start fades faster than the noise",
+                        "Squared bias (left) and variance (right) of a 24-pixel picture, relative to its power, at "
+                        "equal cost. Squared bias under two standard errors is not drawn: weighted seeds have none.");
     plot_csv csv = plot_csv_open("out/startup.csv", "policy,evaluations,bias2,bias2_error,variance,variance_error");
     metro_bias_variance last, first;
     int policy, b, i;
@@ -195,7 +200,8 @@ int main(void)
             bias2_error[b] = error.bias2_error / power;
             variance[b] = error.variance / power;
             plot_csv_text(&csv, policy_name[policy]);
-            PLOT_CSV_ROW(&csv, x[b], error.bias2 / power, error.bias2_error / power, variance[b], error.variance_error / power);
+            PLOT_CSV_ROW(&csv, x[b], error.bias2 / power, error.bias2_error / power, variance[b],
+                         error.variance_error / power);
             printf("  %8.2g +- %-7.1g %8.2g", error.bias2 / power, error.bias2_error / power, variance[b]);
             if (policy == 0 && b == 0) first = error;
             if (policy == 0 && b == 2) last = error;
@@ -207,7 +213,8 @@ int main(void)
         plot_line(&chart.panel[1], x, variance, BUDGETS, policy_name[policy])->color = plot_palette((size_t)policy);
     }
     if (plot_csv_close(&csv) != 0 || plot_save(&chart, "out/startup.svg") != 0) return 1;
-    printf("from one dark point, squared bias is %.0f %% of the mean squared error at %d evaluations and %.0f %% at %d\n",
+    printf("from one dark point, squared bias is %.0f %% of the mean squared error at %d evaluations and %.0f %% at "
+           "%d\n",
            100 * first.bias2 / first.mse, (int)budget[0], 100 * last.bias2 / last.mse, (int)budget[2]);
     return 0;
 }

@@ -1,5 +1,5 @@
-/* make bench: what the laboratory costs. Ratios are taken within one run, alternating, the best of several rounds, because
-   machines are shared and noisy. */
+/* make bench: what the laboratory costs. Ratios are taken within one run, alternating, the best of several rounds,
+   because machines are shared and noisy. */
 
 #if !defined(_POSIX_C_SOURCE)
 #define _POSIX_C_SOURCE 200809L /* clock_gettime */
@@ -126,7 +126,8 @@ static void bench_theory(void)
     static const uint64_t n[8] = { 1, 2, 3, 4, 5, 10, 100, 1000 };
     static const double sizes[5] = { 0.003, 0.05, 0.3, 0.97, 1.43 };
     int shape, i, s;
-    printf("metro_startup_error, worst over sizes .003 to 1.43, microseconds (goal: 50; Kelemen 50000):\n           n =");
+    printf("metro_startup_error, worst over sizes .003 to 1.43, microseconds (goal: 50; Kelemen 50000):\n           "
+           "n =");
     for (i = 0; i < 8; i++) printf(" %8d", (int)n[i]);
     for (shape = 0; shape < 6; shape++) {
         printf("\n  %-11s", name[shape]);

@@ -1,6 +1,6 @@
-/* make calibrate: are the stated errors honest? Each study repeats a small experiment many times with other random numbers and
-   counts how often the interval of 1.96 stated standard errors covers the truth: 95 % is right. The last column is the
-   mean of the squared stated errors over the variance that the repeats show: 1 is right. */
+/* make calibrate: are the stated errors honest? Each study repeats a small experiment many times with other random
+   numbers and counts how often the interval of 1.96 stated standard errors covers the truth: 95 % is right. The last
+   column is the mean of the squared stated errors over the variance that the repeats show: 1 is right. */
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
@@ -24,8 +24,9 @@ static void study_add(study *s, double estimate, double error, double truth)
 static void study_report(const study *s, const char *what, double truth)
 {
     double n = s->count, covered = s->covered / n;
-    printf("%-44s %6.2f +- %.2f %% covered, mean %+.2f standard errors off, variance ratio %.3f\n", what, 100 * covered,
-           100 * sqrt(covered * (1 - covered) / n), (metro_moments_mean(&s->estimate) - truth) / metro_moments_error(&s->estimate),
+    printf("%-44s %6.2f +- %.2f %% covered, mean %+.2f standard errors off, variance ratio %.3f\n", what,
+           100 * covered, 100 * sqrt(covered * (1 - covered) / n),
+           (metro_moments_mean(&s->estimate) - truth) / metro_moments_error(&s->estimate),
            s->variance / n / metro_moments_variance(&s->estimate));
 }
 
@@ -90,7 +91,8 @@ static void study_of_mcse(size_t draws)
         for (c = 0; c < 4; c++) {
             metro_chain chain;
             size_t i;
-            if (metro_chain_make(&target, NULL, metro_rng_make(2, (uint64_t)(4 * run + c)), &chain) != METRO_OK) exit(1);
+            if (metro_chain_make(&target, NULL, metro_rng_make(2, (uint64_t)(4 * run + c)), &chain) != METRO_OK)
+                exit(1);
             metro_chain_start_weighted(&chain, 1000);
             metro_chain_burn(&chain, 50);
             for (i = 0; i < draws; i++) {
@@ -103,7 +105,8 @@ static void study_of_mcse(size_t draws)
             metro_sum sum = { 0, 0 };
             size_t i;
             for (i = 0; i < 4 * draws; i++) metro_sum_add(&sum, draw[i]);
-            study_add(&s, metro_sum_value(&sum) / (double)(4 * draws), metro_mcse_mean(draw, 4, draws), (0.1 + 1 / 3.0) / 0.7);
+            study_add(&s, metro_sum_value(&sum) / (double)(4 * draws), metro_mcse_mean(draw, 4, draws),
+                      (0.1 + 1 / 3.0) / 0.7);
         }
     }
     snprintf(what, sizeof what, "MCSE of the mean, four chains of %d", (int)draws);

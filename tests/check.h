@@ -25,13 +25,13 @@ typedef struct {
 
 static check_state check_global = { 0, 0, 0 };
 
-#define CHECK(condition, ...)                                                                                          \
-    do {                                                                                                               \
-        if (!(condition)) {                                                                                            \
-            check_complain(__FILE__, __LINE__, #condition);                                                            \
-            fprintf(stderr, "    " __VA_ARGS__);                                                                       \
-            fprintf(stderr, "\n");                                                                                     \
-        }                                                                                                              \
+#define CHECK(condition, ...)                                                                                        \
+    do {                                                                                                             \
+        if (!(condition)) {                                                                                          \
+            check_complain(__FILE__, __LINE__, #condition);                                                          \
+            fprintf(stderr, "    " __VA_ARGS__);                                                                     \
+            fprintf(stderr, "\n");                                                                                   \
+        }                                                                                                            \
     } while (0)
 
 /* value equals truth within relative * |truth| (so exactly, where truth is 0 or infinite). */
@@ -49,9 +49,11 @@ static void check_complain(const char *file, int line, const char *what)
     fprintf(stderr, "  %s:%d: %s\n", file, line, what);
 }
 
-static inline void check_near(const char *file, int line, const char *what, double value, double truth, double relative)
+static inline void check_near(const char *file, int line, const char *what, double value, double truth,
+                              double relative)
 {
-    int same = isinf(truth) ? (isinf(value) && (value > 0) == (truth > 0)) : fabs(value - truth) <= relative * fabs(truth);
+    int same = fabs(value - truth) <= relative * fabs(truth);
+    if (isinf(truth)) same = isinf(value) && (value > 0) == (truth > 0);
     if (same) return;
     check_complain(file, line, what);
     fprintf(stderr, "    is %.17g, should be %.17g: relative error %.2g, allowed %.2g\n", value, truth,
@@ -62,7 +64,8 @@ static inline void check_close(const char *file, int line, const char *what, dou
 {
     if (fabs(value - truth) <= bound) return;
     check_complain(file, line, what);
-    fprintf(stderr, "    is %.17g, should be %.17g: off by %.2g, allowed %.2g\n", value, truth, fabs(value - truth), bound);
+    fprintf(stderr, "    is %.17g, should be %.17g: off by %.2g, allowed %.2g\n", value, truth, fabs(value - truth),
+            bound);
 }
 
 static inline void check_sigma(const char *file, int line, const char *what, double value, double truth, double sigma)

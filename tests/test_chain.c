@@ -89,7 +89,8 @@ static metro_target target_of(const metro_axis *axes, size_t count, lab *l)
     return target;
 }
 
-/* Catches: a random number more or less than the algorithm needs, a step on the wrong side of the border, >= for >. */
+/* Catches: a random number more or less than the algorithm needs, a step on the wrong side of the border, >= for >.
+   */
 static void chain_equals_a_loop_written_by_hand(void)
 {
     lab l = lab_of(slope, 10);
@@ -115,7 +116,8 @@ static void chain_equals_a_loop_written_by_hand(void)
 }
 
 /* The mean of each bin over independent chains against the truth; catches any wrong stationary density. */
-static void expect_bins(metro_target *target, const metro_chain_options *options, lab *l, const double *truth, double chains)
+static void expect_bins(metro_target *target, const metro_chain_options *options, lab *l, const double *truth,
+                        double chains)
 {
     uint64_t n = check_count(chains, 30), c;
     metro_moments bin[20];
@@ -217,7 +219,8 @@ static void flat_target_accepts_all(void)
     CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
     CHECK(metro_chain_start_point(&chain, &seed) == METRO_OK, "start");
     metro_chain_run(&chain, 10000);
-    CHECK(chain.counts.accepted == 10000 && chain.counts.longest_stay == 0, "%g accepted", (double)chain.counts.accepted);
+    CHECK(chain.counts.accepted == 10000 && chain.counts.longest_stay == 0, "%g accepted",
+          (double)chain.counts.accepted);
     metro_chain_free(&chain);
 }
 
@@ -283,9 +286,9 @@ static void acceptance_survives_huge_ratios(void)
     CHECK_NEAR(metroi_acceptance(1e300, 1e-300, 1e300 * 1e300), 1.0, 0); /* infinite ratio times 1e-600 */
     CHECK_NEAR(metroi_acceptance(1e-300, 1e300, 1), 1.0, 0);
     CHECK(metroi_acceptance(1e300, 1e-300, 1) == 0, "1e-600 is 0");
-    CHECK_NEAR(metroi_acceptance(1e300, 1e-20, 1e308), 1e-12, 1e-10);   /* 1e-320 is denormal */
+    CHECK_NEAR(metroi_acceptance(1e300, 1e-20, 1e308), 1e-12, 1e-10); /* 1e-320 is denormal */
     CHECK_NEAR(metroi_acceptance(1e-200, 1e200, 1e-300), 1.0, 0);
-    CHECK_NEAR(metroi_acceptance(1e-150, 1e160, 2e-311), .2, 1e-10);    /* 1e310 overflows */
+    CHECK_NEAR(metroi_acceptance(1e-150, 1e160, 2e-311), .2, 1e-10); /* 1e310 overflows */
     CHECK_NEAR(metroi_acceptance(4, 1, 2), .5, 1e-15);
     CHECK(metroi_acceptance(1, 0, 1) == 0 && metroi_acceptance(1, 1, 0) == 0, "zeros");
 }
@@ -319,7 +322,8 @@ static void scale_of_importance_does_not_matter(void)
     }
 }
 
-/* Catches: a forced acceptance out of a dark seed, a division by its importance, a chain changed by a refused start. */
+/* Catches: a forced acceptance out of a dark seed, a division by its importance, a chain changed by a refused start.
+   */
 static void dark_and_bad_seeds_are_refused(void)
 {
     lab l = lab_of(wild, 10);
@@ -366,8 +370,9 @@ static void seeds_are_chosen_by_alpha(void)
     metro_chain_free(&chain);
 }
 
-/* The estimate of the integral of x I(x) by short runs: with the weight of the start it is right after any number of steps,
-   without it it is not. Truth: int x (.2 + x) = .1 + 1/3. Catches: the weight forgotten, candidates drawn uniformly. */
+/* The estimate of the integral of x I(x) by short runs: with the weight of the start it is right after any number of
+   steps, without it it is not. Truth: int x (.2 + x) = .1 + 1/3. Catches: the weight forgotten, candidates drawn
+   uniformly. */
 static void weighted_seeds_are_unbiased_at_every_step(void)
 {
     lab l = lab_of(slope, 20);
@@ -449,7 +454,8 @@ static void b_comes_with_its_error(void)
         CHECK(metro_chain_start_point(&chain, &seed) == METRO_OK, "start");
         metro_chain_survey(&chain, 10);
         metro_chain_run(&chain, 100);
-        CHECK(chain.normalisation.count == 10 + chain.counts.large_steps, "b from %g draws", (double)chain.normalisation.count);
+        CHECK(chain.normalisation.count == 10 + chain.counts.large_steps, "b from %g draws",
+              (double)chain.normalisation.count);
         metro_moments_add(&b, metro_chain_b(&chain, &error));
         sum += error * error;
         metro_chain_free(&chain);
@@ -512,7 +518,8 @@ static void expected_values_lower_the_variance(void)
             metro_moments_add(&mean[e], l.bin[0] / 100);
             metro_chain_free(&chain);
         }
-    for (e = 0; e < 2; e++) CHECK_CLOSE(metro_moments_mean(&mean[e]), .225 / .7, .004 + 6 * metro_moments_error(&mean[e]));
+    for (e = 0; e < 2; e++)
+        CHECK_CLOSE(metro_moments_mean(&mean[e]), .225 / .7, .004 + 6 * metro_moments_error(&mean[e]));
     CHECK(metro_moments_variance(&mean[1]) < metro_moments_variance(&mean[0]), "%g with, %g without expected values",
           metro_moments_variance(&mean[1]), metro_moments_variance(&mean[0]));
 }
@@ -529,7 +536,8 @@ static void counts_are_kept(void)
     CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 9), &chain) == METRO_OK, "make");
     CHECK(metro_chain_start_point(&chain, &seed) == METRO_OK, "start");
     metro_chain_burn(&chain, 1000);
-    CHECK(l.records == 0 && chain.weight == 0 && chain.counts.steps == 0 && chain.counts.dark == 0, "the burn-in left traces");
+    CHECK(l.records == 0 && chain.weight == 0 && chain.counts.steps == 0 && chain.counts.dark == 0,
+          "the burn-in left traces");
     for (i = 0; i < 2000; i++) {
         stay = metro_chain_step(&chain) ? 0 : stay + 1;
         if (stay > longest) longest = stay;

@@ -64,7 +64,8 @@ static metro_balance balance_of(const metro_target *target,
 /* Catches: a check that complains of a correct chain, on any kind of axis, shape and target. */
 static void balanced_chains_pass(void)
 {
-    metro_shape shapes[] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN, METRO_CAUCHY, METRO_KELEMEN, METRO_VON_MISES };
+    metro_shape shapes[] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN,
+                             METRO_CAUCHY,  METRO_KELEMEN,  METRO_VON_MISES };
     function_of_x *functions[] = { flat, slope, peak, huge_peak };
     int s, f;
     for (s = 0; s < 6; s++)
@@ -142,12 +143,14 @@ static void expect_unbalanced(const char *what, const metro_target *target,
 {
     metro_balance balance = balance_of(target, step, 16);
     CHECK(balance.probability < 1e-6, "%s passes: chi-square %g of %g", what, balance.chi_square, balance.freedom);
-    CHECK(balance.excess > 0 && balance.excess <= 1 && balance.from != balance.to, "%s: excess %g", what, balance.excess);
+    CHECK(balance.excess > 0 && balance.excess <= 1 && balance.from != balance.to, "%s: excess %g", what,
+          balance.excess);
 }
 
 static void planted_mistakes_are_found(void)
 {
-    metro_axis interval = axis_of(METRO_INTERVAL, METRO_UNIFORM, .3), circle = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
+    metro_axis interval = axis_of(METRO_INTERVAL, METRO_UNIFORM, .3),
+               circle = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
     function_of_x *function = flat;
     metro_target target = target_of(&interval, 1, &function);
     metro_balance balance;
@@ -175,7 +178,8 @@ static void probabilities_are_uniform(void)
     int i, n = (int)check_count(400, 40), low = 0;
     for (i = 0; i < n; i++) {
         metro_balance balance;
-        CHECK(metro_balance_check(&target, NULL, 20000, 12, metro_rng_make(9, (uint64_t)i), &balance) == METRO_OK, "check");
+        CHECK(metro_balance_check(&target, NULL, 20000, 12, metro_rng_make(9, (uint64_t)i), &balance) == METRO_OK,
+              "check");
         low += balance.probability < .25;
     }
     CHECK_SIGMA((double)low / n, .25, sqrt(.25 * .75 / n));
@@ -196,8 +200,8 @@ static void balance_refuses_nonsense(void)
     CHECK(metro_balance_check(&target, NULL, 100, 16, rng, &balance) == METRO_ERROR_ARGUMENT, "size 0");
 }
 
-/* E_n^2 over the harmonics up to K along each axis, from the spectra of the kernels and one or several seeds: paper (12) and
-   the corrected (15) in the order of the definition, with nothing of chapter 5. */
+/* E_n^2 over the harmonics up to K along each axis, from the spectra of the kernels and one or several seeds: paper
+   (12) and the corrected (15) in the order of the definition, with nothing of chapter 5. */
 static double truth_of(const metro_axis *axes, size_t count, const double *seed, const double *alpha, size_t seeds,
                        int K, uint64_t n, double large)
 {
@@ -231,7 +235,8 @@ static double truth_of(const metro_axis *axes, size_t count, const double *seed,
     return sum;
 }
 
-/* Catches: a wrong spectrum or a wrong chain, bins, a bias of the squared modulus (J groups and eq 7.17 remove it). */
+/* Catches: a wrong spectrum or a wrong chain, bins, a bias of the squared modulus (J groups and eq 7.17 remove it).
+   */
 static void expect_theory(const metro_axis *axes, size_t count, const double *seed, const double *alpha, size_t seeds,
                           int K, double large, double chains, int agree)
 {
@@ -268,7 +273,8 @@ static void expect_theory(const metro_axis *axes, size_t count, const double *se
 static void ensembles_meet_the_theory(void)
 {
     static const double seed[10] = { .1, .3, .35, .6, .8, .2, .4, .7, .9, .5 }, alpha[3] = { .2, .3, .5 };
-    metro_shape shapes[] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN, METRO_CAUCHY, METRO_KELEMEN, METRO_VON_MISES };
+    metro_shape shapes[] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_GAUSSIAN,
+                             METRO_CAUCHY,  METRO_KELEMEN,  METRO_VON_MISES };
     double sizes[] = { .3, .5, .1, .03, .4, 4 };
     metro_axis axes[5];
     int s, i;
@@ -320,8 +326,8 @@ static void planted_mistakes_miss_the_theory(void)
     CHECK(fabs(squared - truth) > 6 * error, "half-width is not seen: %g +- %g, truth %g", squared, error, truth);
 }
 
-/* Catches: an error bar that is too small or too large. Over many ensembles the estimates must scatter as the mean of the
-   stated variances says, where E_n is large and where it is zero. */
+/* Catches: an error bar that is too small or too large. Over many ensembles the estimates must scatter as the mean of
+   the stated variances says, where E_n is large and where it is zero. */
 static void stated_errors_are_those_seen(void)
 {
     static const uint64_t steps[2] = { 2, 200 };
@@ -351,8 +357,7 @@ static void stated_errors_are_those_seen(void)
         }
     }
     CHECK_SIGMA(metro_moments_mean(&estimate[1]), 0.0, metro_moments_error(&estimate[1]));
-    for (t = 0; t < 2; t++)
-        CHECK_SIGMA(variance[t] / metro_moments_variance(&estimate[t]), 1.0, 1.5 * sqrt(2.0 / n));
+    for (t = 0; t < 2; t++) CHECK_SIGMA(variance[t] / metro_moments_variance(&estimate[t]), 1.0, 1.5 * sqrt(2.0 / n));
 }
 
 /* Catches: an answer that depends on the threads, nonsense that is taken. */

@@ -35,7 +35,8 @@ static void results_have_words(void)
     for (a = METRO_OK; a <= METRO_ERROR_STOPPED; a++) {
         CHECK(strlen(metro_result_text((metro_result)a)) > 5, "result %d", a);
         for (b = METRO_OK; b < a; b++)
-            CHECK(strcmp(metro_result_text((metro_result)a), metro_result_text((metro_result)b)) != 0, "%d and %d", a, b);
+            CHECK(strcmp(metro_result_text((metro_result)a), metro_result_text((metro_result)b)) != 0, "%d and %d", a,
+                  b);
     }
     CHECK(strcmp(metro_result_text((metro_result)99), "unknown result") == 0, "a number that is no result");
 }
@@ -99,10 +100,7 @@ static metro_result fold_numbers(uint64_t job, const void *slot, void *user)
     return METRO_OK;
 }
 
-static int stop_after(uint64_t rounds_done, void *user)
-{
-    return rounds_done >= ((trace *)user)->stop_after;
-}
+static int stop_after(uint64_t rounds_done, void *user) { return rounds_done >= ((trace *)user)->stop_after; }
 
 static metro_rounds plan_of(uint64_t rounds, size_t jobs, size_t threads)
 {
@@ -136,7 +134,8 @@ static void rounds_do_not_depend_on_threads(void)
         metro_rounds plan = plan_of(4, 13, threads[i]);
         CHECK(metro_rounds_run(&plan, &t) == METRO_OK, "threads %d", (int)threads[i]);
         CHECK(t.count == 52, "%d jobs merged", (int)t.count);
-        for (job = 0; job < 52; job++) CHECK(t.merged[job] == job, "job %d at place %d", (int)t.merged[job], (int)job);
+        for (job = 0; job < 52; job++)
+            CHECK(t.merged[job] == job, "job %d at place %d", (int)t.merged[job], (int)job);
         if (i == 0) fold = t.fold;
         CHECK(t.fold == fold, "another answer on %d threads", (int)threads[i]);
     }
