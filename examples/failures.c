@@ -311,7 +311,7 @@ static double importance_at(size_t target, double x)
 {
     const double s = target == 1 ? 0.02 : 0.03, a = (x - 0.25) / s, b = (x - 0.75) / s, c = (x - 0.5) / s;
     if (target == 0) return 1;
-    return 0.01 + (target == 1 ? exp(-c * c / 2) : exp(-a * a / 2) + exp(-b * b / 2));
+    return target == 1 ? 0.01 + exp(-c * c / 2) : 1e-4 + exp(-a * a / 2) + exp(-b * b / 2);
 }
 
 static double size_of(size_t i) { return 0.02 * pow(2.0 / 0.02, (double)i / (SIZES - 1)); }
