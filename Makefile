@@ -29,7 +29,7 @@ all: $(EXAMPLES) build/weave
 build out:
 	@mkdir -p $@
 
-build/test_%: tests/test_%.c tests/check.h metro.h examples/plot.h | build
+build/test_%: tests/test_%.c tests/check.h tests/memory.h metro.h examples/plot.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
 build/bench_%: tests/bench_%.c metro.h | build

@@ -1,29 +1,7 @@
 /* Chapter 1: results, vectors, rounds of jobs. */
 
-#include <stdlib.h>
+#include "memory.h"
 
-static long allocations_left = -1; /* -1: every allocation succeeds */
-static long allocations_live = 0;
-
-static void *counted_malloc(size_t size)
-{
-    void *memory;
-    if (allocations_left == 0) return NULL;
-    if (allocations_left > 0) allocations_left--;
-    memory = malloc(size);
-    if (memory != NULL) allocations_live++;
-    return memory;
-}
-
-static void counted_free(void *memory)
-{
-    if (memory != NULL) allocations_live--;
-    free(memory);
-}
-
-#define METRO_MALLOC(size) counted_malloc(size)
-#define METRO_REALLOC(pointer, size) realloc(pointer, size)
-#define METRO_FREE(pointer) counted_free(pointer)
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
