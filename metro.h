@@ -6958,8 +6958,8 @@ METRO_API metro_result metro_balance_check(const metro_target *target,
 
        T_{ab} = sum_{k != 0} c_a(k) c_b(-k),    E_n^2 ~ frac{1}{J (J-1)} sum_{a != b} T_{ab}                 (7.17)
 
-   is unbiased: the estimate is 0 in the mean when the chains have forgotten their seed, and is then as often negative
-   as positive. A histogram would have a bias that depends on the width of its bins.
+   is unbiased: the estimate is 0 in the mean when the chains have forgotten their seed, and must be allowed to be
+   negative. A histogram would have a bias that depends on the width of its bins.
 
    This is a U-statistic, and the variance of such a mean over pairs can be estimated without bias from the same
    matrix. The product of two terms with four different groups has mean E_n^4, so
