@@ -563,7 +563,8 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error);
    Accuracy, unless said otherwise: relative 1e-12, or 1e-12 of the logarithm where that is larger. METRO_KELEMEN from
    n = 3 on: that while C = (1/s1 + 1/s2)/(2 pi ln(s2/s1)) is below 200, else 1e-9, and NaN where half a million terms
    would not give that, which is for C above some thousands: sizes that are tiny beside the circle or close to each
-   other. Lengths below 1e-100 give NaN, and METRO_KELEMEN of sizes above 10000 at n = 1. */
+   other; at n = 2 sizes within 1e-6 of each other lose a digit for every power of ten closer. Lengths below 1e-100
+   give NaN, and METRO_KELEMEN of sizes above 10000 at n = 1. */
 
 /* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: at most some 35 modes for every n
    and size, METRO_VON_MISES 300 (METRO_KELEMEN: up to some 60000 terms at n = 2 and 3, falling from there); `make
@@ -2037,6 +2038,7 @@ static double metroi_bessel_log(double order, double k, double kappa)
 static double metroi_bessel_product(double order, double k, double kappa)
 {
     double product = 1, r = 0, j;
+    if (!(kappa > 0)) return 0; /* a negative zero, too */
     if (!(k * asinh(k / kappa) - k * k / (hypot(k, kappa) + kappa) <= 760)) return 0;
     for (j = ceil(k + 60 + 1.5 * sqrt(40 * kappa)); j >= 1; j--) {
         r = 1 / (2 * (order + j) / kappa + r); /* eq 3.9 */
@@ -2809,7 +2811,7 @@ METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double 
     const metro_target *target = &chain->target;
     size_t doubles = metroi_state_doubles(target), chosen = 0, i;
     double seen = 0;
-    if (!metroi_weights_valid(alpha, seeds)) return METRO_ERROR_ARGUMENT;
+    if (z == NULL || !metroi_weights_valid(alpha, seeds)) return METRO_ERROR_ARGUMENT;
     for (i = 0; i < seeds; i++) {
         metro_result result;
         double weight = alpha != NULL ? alpha[i] : 1;
@@ -4343,7 +4345,8 @@ static metroi_scaled metroi_cone_square(double f, double log_f, double n)
 {
     double phi[6], tau;
     int i;
-    if (n < 3) return metroi_sphere_square(metroi_cone_twice(f > 1e-30 ? f : 1e-30), log_f);
+    /* Towards the hemisphere the integrand of eq 5.53 bends too sharply for its 24 points, and the series is short */
+    if (n < 3 && f < 0.3) return metroi_sphere_square(metroi_cone_twice(f > 1e-30 ? f : 1e-30), log_f);
     if (n * f >= METROI_NEAR_PLANE) return metroi_scaled_make(1, metroi_cone_series(f, n) + 2 * n * log1p(-f));
     for (i = 1; i <= 6; i++) {
         tau = METROI_NEAR_PLANE * i;
@@ -7195,7 +7198,7 @@ static int metroi_ensemble_valid(const metro_ensemble *ensemble)
     size_t t;
     for (t = 1; t < ensemble->times; t++)
         if (ensemble->steps[t] < ensemble->steps[t - 1]) return 0;
-    return ensemble->times > 0 && ensemble->chains > 0 && ensemble->seeds > 0 &&
+    return ensemble->times > 0 && ensemble->chains > 0 && ensemble->seeds > 0 && ensemble->seed != NULL &&
            (ensemble->jobs == 0 || ensemble->jobs >= 4);
 }
 

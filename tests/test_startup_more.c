@@ -583,6 +583,17 @@ static void memory(void)
     CHECK(at == 3, "%ld allocations", at);
 }
 
+/* Two steps of a cone near the hemisphere, against the series summed to 10^6 terms in quadruple precision. Catches: a
+   quadrature that is too coarse where the density bends. A concentration of negative zero is zero. */
+static void wide_cones_and_negative_zero(void)
+{
+    metro_kernel k = kernel_make(METRO_VON_MISES, 0, -0.0, 0);
+    CHECK_NEAR(metro_cone_startup_log_error(1.4934827879354808, 2), -0.6837209872364434, 1e-12);
+    CHECK_NEAR(metro_cone_startup_log_error(1.5585210647690244, 2), -0.8074867891715991, 1e-12);
+    CHECK(metro_kernel_coefficient(&k, 2000000000) == 0, "kappa -0 on the circle");
+    CHECK(metro_vmf_coefficient(-0.0, 2000000000) == 0, "kappa -0 on the sphere");
+}
+
 int main(void)
 {
     CHECK_RUN(sphere_tables);
@@ -598,5 +609,6 @@ int main(void)
     CHECK_RUN(best_sweep);
     CHECK_RUN(refused);
     CHECK_RUN(memory);
+    CHECK_RUN(wide_cones_and_negative_zero);
     return check_done("startup_more");
 }
