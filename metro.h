@@ -98,18 +98,19 @@
        5.7 Uniform perturbations
        5.8 Gaussian, Cauchy and von Mises perturbations
        5.9 Kelemen's perturbations
-       5.10 Large steps
-       5.11 Many seeds
-       5.12 The interval
-       5.13 More dimensions
-       5.14 The running mean
-       5.15 The density itself
-       5.16 Other distances
-       5.17 The sphere
-       5.18 The error of a run
-       5.19 Covariances by doubling
-       5.20 A chain that starts in equilibrium
-       5.21 The best size
+       5.10 Kelemen's far modes
+       5.11 Large steps
+       5.12 Many seeds
+       5.13 The interval
+       5.14 More dimensions
+       5.15 The running mean
+       5.16 The density itself
+       5.17 Other distances
+       5.18 The sphere
+       5.19 The error of a run
+       5.20 Covariances by doubling
+       5.21 A chain that starts in equilibrium
+       5.22 The best size
        6 The operator
        6.1 From an importance to a matrix
        6.2 What the seed leaves behind
@@ -560,55 +561,56 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error);
    Each error comes a second time as its natural logarithm, which is finite where the error itself underflows:
    -INFINITY means that the error is exactly 0.
 
-   Accuracy, unless said otherwise: relative 1e-12, or 1e-12 of the logarithm where that is larger. METRO_KELEMEN from
-   n = 3 on: that while C = (1/s1 + 1/s2)/(2 pi ln(s2/s1)) is below 200, else 1e-9, and NaN where half a million terms
-   would not give that, which is for C above some thousands: sizes that are tiny beside the circle or close to each
-   other; at n = 2 sizes within 1e-6 of each other lose a digit for every power of ten closer. Lengths below 1e-100
-   give NaN, and METRO_KELEMEN of sizes above 10000 at n = 1. */
+   Accuracy, unless said otherwise: relative 1e-12, or 1e-12 of the logarithm where that is larger, for METRO_KELEMEN
+   too, whatever the ratio of its sizes; 1e-9 for METRO_KELEMEN of sizes above 10, which may need half a million
+   terms. Lengths below 1e-100 give NaN, and so does METRO_KELEMEN of sizes above 10000 at n = 1, and of sizes so
+   close to each other that p_n is still a set of separate peaks beyond n = 5e11. */
 
 /* The start-up error E_n after `n` steps from one seed, eq 5.7, paper (12). Cost: at most some 35 modes for every n
-   and size, METRO_VON_MISES 300 (METRO_KELEMEN: up to some 60000 terms at n = 2 and 3, falling from there); `make
-   bench` says what that takes. */
+   and size, METRO_VON_MISES 300 (METRO_KELEMEN: up to some 20000 terms, beside the exception above); `make bench`
+   says what that takes. */
 METRO_API double metro_startup_error(const metro_kernel *k, uint64_t n);
 METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n);
 
-/* The same when the chain starts at `seed[i]` with probability `alpha[i]`, i < `seeds`: eq 5.31, which is paper (15)
+/* The same when the chain starts at `seed[i]` with probability `alpha[i]`, i < `seeds`: eq 5.41, which is paper (15)
    corrected. `alpha` NULL means equal weights. Seeds are points of the circle and taken modulo 1. NaN when `seed` is
    NULL or `seeds` is 0, when a seed is not finite, when a weight is negative or not finite, and when the weights do
    not sum to 1 within 1e-9. Where seeds cancel modes (equispaced ones) the error is small against that of one seed,
-   and is known to 1e-13 of the latter, to 1e-8 for n <= 2; the logarithm is -INFINITY when nothing is left. Cost: for
-   n >= 3 proportional to `seeds`, one sine and cosine a seed for each of a number of modes that is about 150/size at
-   n = 3 and 1/size from n = 10 on; for n <= 2 (METRO_TRIANGLE: n = 1), for up to eight seeds that do not cancel
-   modes, and for seeds much farther apart than the chain has gone, proportional to seeds^2 but without the modes. */
+   and is known to 1e-13 of the latter, to 1e-8 for n <= 2 and to 1e-6 for METRO_KELEMEN with more than 5000 modes;
+   the logarithm is -INFINITY when nothing is left. Cost: for n >= 3 proportional to `seeds`, one sine and cosine a
+   seed for each of a number of modes that is about 150/size at n = 3 and 1/size from n = 10 on; for n <= 2
+   (METRO_TRIANGLE: n = 1), for up to eight seeds that do not cancel modes, and for seeds much farther apart than the
+   chain has gone, proportional to seeds^2 but without the modes. */
 METRO_API double metro_startup_error_seeds(const metro_kernel *k, uint64_t n, const double *seed, const double *alpha,
                                            size_t seeds);
 METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n, const double *seed,
                                                const double *alpha, size_t seeds);
 
 /* The error of the running mean (p_burn + .. + p_{burn+steps-1})/steps, which is the density that a sample picked at
-   random among `steps` samples after a burn-in has; one seed; eq 5.38. burn = 0 includes p_0: +INFINITY. steps = 0:
-   NaN. Cost: at most some 400 modes while burn + steps <= 1000 (METRO_KELEMEN: some 90000); for tiny sizes it grows
-   with the square root of `steps`. */
+   random among `steps` samples after a burn-in has; one seed; eq 5.48. burn = 0 includes p_0: +INFINITY. steps = 0:
+   NaN. Cost: at most some 400 modes while burn + steps <= 1000 (METRO_KELEMEN: some 20000 terms, but a million where
+   its sizes are within some 1e-3 of each other); for tiny sizes it grows with the square root of `steps`. NaN for
+   METRO_KELEMEN of such close sizes when burn + steps is above some 4000 and half a million modes would not do. */
 METRO_API double metro_startup_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t burn, uint64_t steps);
 
-/* The density p_n at `x` (taken modulo 1) of a chain that starts as in metro_startup_error_seeds: eqs 5.5 and 5.30,
+/* The density p_n at `x` (taken modulo 1) of a chain that starts as in metro_startup_error_seeds: eqs 5.5 and 5.40,
    paper (9) and (14). n = 0: +INFINITY at a seed of positive weight, 0 elsewhere. n = 1: metro_kernel_density, so at
    a jump the mean of both sides. NaN for the arguments that give NaN there, for an `x` that is not finite, and for
-   METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density, or of a size above 10000 at n = 2
-   and 3. The error is below 1e-13 of the largest value of p_n (METRO_KELEMEN from n = 5 on: 1e-12 while C is below
-   50, else as above). Cost: at most some 70 modes a seed, METRO_VON_MISES 300; METRO_KELEMEN: up to some 100000 terms
-   from n = 3 on. */
+   METRO_KELEMEN with `size_min` == `size` from n = 2 on, where there is no density, or of a size above 10000 at n =
+   2. The error is below 1e-13 of the largest value of p_n (METRO_KELEMEN: 1e-12; 1e-9 at n = 3 for sizes above some 1
+   and far apart, and from n = 4 on for sizes above 10). Cost: at most some 70 modes a seed, METRO_VON_MISES 300;
+   METRO_KELEMEN: up to some 20000 terms from n = 3 on. */
 METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double x, const double *seed,
                                        const double *alpha, size_t seeds);
 
 /* The start-up error of a chain on a torus that perturbs `axes` circle coordinates at once, coordinate i by the
-   kernel `k[i]`, from one seed: eq 5.36. NaN for axes = 0 and when one of the kernels is invalid. Cost: that of the
+   kernel `k[i]`, from one seed: eq 5.46. NaN for axes = 0 and when one of the kernels is invalid. Cost: that of the
    axes. */
 METRO_API double metro_startup_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
 METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
 
-/* The start-up error on the interval [0, 1] with reflecting ends, from the seed `x0`: eq 5.34. A seed beyond the ends
+/* The start-up error on the interval [0, 1] with reflecting ends, from the seed `x0`: eq 5.44. A seed beyond the ends
    is folded back; one that is not finite gives NaN, and so does METRO_VON_MISES, which lives on the circle only.
    Accuracy and cost: as metro_startup_error_seeds with two seeds. */
 METRO_API double metro_reflect_startup_error(const metro_kernel *k, double x0, uint64_t n);
@@ -616,8 +618,8 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
 
 /* Upper bounds of two other distances between p_n, from one seed, and the uniform density: the total variation (1/2)
    int abs(p_n - 1), at most min(1, E_n/2), and the Kullback-Leibler divergence int p_n ln p_n in nats, at most ln(1 +
-   E_n^2): eqs 5.46 and 5.47. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
-   5.48 and 5.49. At n = 0 the distances are 1 and +INFINITY. */
+   E_n^2): eqs 5.56 and 5.57. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
+   5.58 and 5.59. At n = 0 the distances are 1 and +INFINITY. */
 METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n);
 METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n);
 
@@ -625,7 +627,7 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
 
 /* The start-up error of a direction, from one seed, after `n` perturbations inside a cone of `half_angle` radians:
    the L2 distance of p_n from the uniform density, both taken against the uniform probability on the sphere (for the
-   distance of the densities per steradian divide by sqrt(4 pi)), eq 5.50. And its natural logarithm, finite where the
+   distance of the densities per steradian divide by sqrt(4 pi)), eq 5.60. And its natural logarithm, finite where the
    error underflows; -INFINITY means that the error is exactly 0. n = 0 gives +INFINITY; from `half_angle` pi on and n
    >= 1 the error is exactly 0. NaN when `half_angle` is not positive and finite. Relative error 1e-12, or 1e-12 of
    the logarithm where that is larger. Cost: at most some 4000 degrees for every n and angle. The half angle is half
@@ -657,7 +659,7 @@ typedef struct {
    * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite, seeds or weights that
    metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is untouched then.
    Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0 is exactly 0.
-   Cost: at most two joins (eq 5.62) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
+   Cost: at most two joins (eq 5.72) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
    and some multiplications for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a
    pair. */
 METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
@@ -1899,11 +1901,15 @@ static void metroi_kelemen_narrow(double frequency, double s2, double b, double 
     }
 }
 
-/* Ci(2 pi f s) for an argument x above 4. To 50 by the continued fraction of the exponential integral, evaluated
+/* Above x = 4 the cosine integral is the real part of an exponential integral whose oscillation can be taken out,
+
+       Ci(x) = -Re(e^{-i x} h(x)), h(x) = e^{i x} E_1(i x)                            (3.8)
+
+   and h is smooth, near 1/(i x). It is had to x = 50 by the continued fraction of the exponential integral, evaluated
    forwards (Lentz 1976, in the form of Press et al. 1992, cisi); above by the asymptotic series (Abramowitz and
    Stegun 1964, 5.2.34 and 5.2.35), whose smallest term at 50 is 1e-22. Sine and cosine come from section 3.2. */
 
-static double metroi_cosine_integral_series(double x, double sine, double cosine)
+static void metroi_exponential_series(double x, double *re, double *im)
 {
     double z = 1 / (x * x), f = 1, g = 1, even = 1, odd = 1, m;
     for (m = 1; m <= 40 && odd > 1e-18; m++) {
@@ -1912,10 +1918,11 @@ static double metroi_cosine_integral_series(double x, double sine, double cosine
         f += fmod(m, 2) > 0 ? -even : even;
         g += fmod(m, 2) > 0 ? -odd : odd;
     }
-    return (sine * f - cosine * g / x) / x;
+    *re = g / x / x;
+    *im = -f / x;
 }
 
-static double metroi_cosine_integral_fraction(double x, double sine, double cosine)
+static void metroi_exponential_fraction(double x, double *re, double *im)
 {
     double scale = 1 / (1 + x * x), dr = scale, di = -x * scale, hr = dr, hi = di, cr = 1e300, ci = 0, br = 1, t, u;
     int i;
@@ -1941,13 +1948,20 @@ static double metroi_cosine_integral_fraction(double x, double sine, double cosi
         hr = scale;
         if (fabs(t - 1) + fabs(u) < 1e-16) break;
     }
-    return -(cosine * hr + sine * hi);
+    *re = hr;
+    *im = hi;
+}
+
+static void metroi_exponential_integral(double x, double *re, double *im)
+{
+    if (x <= 50) metroi_exponential_fraction(x, re, im);
+    else metroi_exponential_series(x, re, im);
 }
 
 /* Ci(2 pi f s). Below 4: gamma + ln x - sum (-1)^{m+1} x^{2m}/(2m (2m)!), Abramowitz and Stegun (1964), 5.2.16. */
 static double metroi_cosine_integral(double frequency, double s)
 {
-    double x = 2 * METROI_PI * frequency * s, power = 1, sum = 0, sine, cosine, m;
+    double x = 2 * METROI_PI * frequency * s, power = 1, sum = 0, re, im, m;
     if (x <= 4) {
         for (m = 1; m <= 20 && fabs(power) > 1e-18; m++) {
             power *= -x * x / ((2 * m - 1) * 2 * m);
@@ -1956,10 +1970,8 @@ static double metroi_cosine_integral(double frequency, double s)
         return 0.57721566490153286061 + log(x) + sum;
     }
     if (!(x < 1e300)) return 0;
-    sine = metroi_sin_pi(2 * frequency, s);
-    cosine = metroi_cos_pi(2 * frequency, s);
-    if (x <= 50) return metroi_cosine_integral_fraction(x, sine, cosine);
-    return metroi_cosine_integral_series(x, sine, cosine);
+    metroi_exponential_integral(x, &re, &im);
+    return -(metroi_cos_pi(2 * frequency, s) * re + metroi_sin_pi(2 * frequency, s) * im);
 }
 
 /* The transform of Kelemen's kernel at any frequency of at least 0 (whole or half-whole, for exact phases) and its
@@ -1994,7 +2006,7 @@ static void metroi_kelemen_mode(double s1, double s2, double frequency, double *
 
        ln I_nu(kappa) ~ kappa - frac{ln(2 pi kappa)}{2} + A(nu)
        A(nu) = frac{nu^2}{S + kappa} - nu asinh(nu/kappa) - frac{1}{4} ln(1 + nu^2/kappa^2)
-               + ln(1 + d(nu))                                                        (3.8)
+               + ln(1 + d(nu))                                                        (3.9)
 
    where d(nu) is the sum of u_m(nu/S)/nu^m. Each term of A is small where nu is small, so the logarithm of a
    coefficient near 1 keeps all its digits. Four terms of d leave 2e-16 at S = 1000. */
@@ -2024,15 +2036,15 @@ static double metroi_debye_log(double nu, double kappa, double *d)
 static double metroi_bessel_log(double order, double k, double kappa)
 {
     double d, d0, low = metroi_debye_log(order, kappa, &d0), high = metroi_debye_log(order + k, kappa, &d);
-    return high - low + log1p((d - d0) / (1 + d0)); /* eq 3.8 */
+    return high - low + log1p((d - d0) / (1 + d0)); /* eq 3.9 */
 }
 
 /* Below kappa = 1000 we multiply the ratios of neighbours, r_j = I_{c+j}/I_{c+j-1}, which follow from each other
    downwards, where the recurrence is stable (Gautschi 1967),
 
-       r_j = frac{1}{2(c + j)/kappa + r_{j+1}}                                        (3.9)
+       r_j = frac{1}{2(c + j)/kappa + r_{j+1}}                                        (3.10)
 
-   from far enough out that starting at 0 is forgotten. Where the leading term of eq 3.8 says that the product
+   from far enough out that starting at 0 is forgotten. Where the leading term of eq 3.9 says that the product
    underflows, it is 0. */
 
 static double metroi_bessel_product(double order, double k, double kappa)
@@ -2041,7 +2053,7 @@ static double metroi_bessel_product(double order, double k, double kappa)
     if (!(kappa > 0)) return 0; /* a negative zero, too */
     if (!(k * asinh(k / kappa) - k * k / (hypot(k, kappa) + kappa) <= 760)) return 0;
     for (j = ceil(k + 60 + 1.5 * sqrt(40 * kappa)); j >= 1; j--) {
-        r = 1 / (2 * (order + j) / kappa + r); /* eq 3.9 */
+        r = 1 / (2 * (order + j) / kappa + r); /* eq 3.10 */
         if (j <= k) product *= r;
     }
     return product;
@@ -2050,7 +2062,7 @@ static double metroi_bessel_product(double order, double k, double kappa)
 /* Products of numbers near 1 lose their distance from 1. For one von Mises coefficient that distance is an integral
    of positive terms,
 
-       1 - P*(k) = frac{sum_{j} w_j 2 sin^2(pi k j/N)}{sum_{j} w_j}, w_j = e^{-2 kappa sin^2(pi j/N)}      (3.10)
+       1 - P*(k) = frac{sum_{j} w_j 2 sin^2(pi k j/N)}{sum_{j} w_j}, w_j = e^{-2 kappa sin^2(pi j/N)}      (3.11)
 
    over the N points of the trapezoidal rule, which converges faster than any power of 1/N for a periodic function
    (Trefethen and Weideman 2014); N = 12 sqrt(kappa) + 48 + k leaves nothing that a double can see. Terms stop at w_j
@@ -2068,16 +2080,16 @@ static double metroi_von_mises_mean(double kappa, double k, double *gap)
         sum += w;
         moment += w * 2 * s * s;
     }
-    *gap = moment / sum; /* eq 3.10 */
+    *gap = moment / sum; /* eq 3.11 */
     return sum / nodes;
 }
 
 /* Chapter 5 wants all coefficients up to some k, as logarithms that are right both where P* is near 1 and where it
    has all but vanished. Upwards, the gaps follow from each other,
 
-       delta_{k+1} = delta_{k-1} + frac{2(c + k)}{kappa} (1 - delta_k), delta_0 = 0   (3.11)
+       delta_{k+1} = delta_{k-1} + frac{2(c + k)}{kappa} (1 - delta_k), delta_0 = 0   (3.12)
 
-   stably while P* is not small; beyond delta = 3/4 the ratios of eq 3.9 take over. */
+   stably while P* is not small; beyond delta = 3/4 the ratios of eq 3.10 take over. */
 
 static void metroi_bessel_logs(double order, double first_gap, double kappa, size_t count, double *log_value)
 {
@@ -2089,13 +2101,13 @@ static void metroi_bessel_logs(double order, double first_gap, double kappa, siz
     }
     /* ratios, downwards */
     for (j = count + 60 + (size_t)(1.5 * sqrt(40 * kappa)); j >= 1; j--) {
-        r = 1 / (2 * (order + (double)j) / kappa + r); /* eq 3.9 */
+        r = 1 / (2 * (order + (double)j) / kappa + r); /* eq 3.10 */
         if (j <= count) log_value[j - 1] = r;
     }
     /* gaps, upwards */
     for (j = 1; j <= count && kappa >= 1 && gap < 0.75; j++) {
         log_value[j - 1] = log1p(-gap);
-        next = before + 2 * (order + (double)j) / kappa * (1 - gap); /* eq 3.11 */
+        next = before + 2 * (order + (double)j) / kappa * (1 - gap); /* eq 3.12 */
         before = gap;
         gap = next;
     }
@@ -2147,7 +2159,7 @@ static void metroi_sinc_mode(double frequency, double h, double *value, double *
         *gap = metroi_sinc_gap(y);
         *value = 1 - *gap;
     } else {
-        *value = y < 1e300 ? metroi_sin_pi(frequency, h) / y : 0; /* eq 5.17 */
+        *value = y < 1e300 ? metroi_sin_pi(frequency, h) / y : 0; /* eq 5.19 */
         *gap = 1 - *value;
     }
 }
@@ -2211,7 +2223,7 @@ static double metroi_uniform_density(double size, double d)
 /* The triangle whose half base h exceeds 1/2: what differs from the uniform density is itself a small triangle, whose
    half base g is the distance of h from the nearest whole number,
 
-       P(d) = 1 + frac{max(0, g - d) - g^2}{h^2}                                      (3.12)
+       P(d) = 1 + frac{max(0, g - d) - g^2}{h^2}                                      (3.13)
 
    as its coefficients sinc(k h)^2 = (g/h)^2 sinc(k g)^2 say. */
 
@@ -2219,7 +2231,7 @@ static double metroi_triangle_density(double size, double d)
 {
     double h = 0.5 * size, g = fabs(h - rint(h));
     if (h <= 0.5) return d < h ? (1 - d / h) / h : 0;
-    return 1 + ((d < g ? g - d : 0) / h - g * (g / h)) / h; /* eq 3.12 */
+    return 1 + ((d < g ? g - d : 0) / h - g * (g / h)) / h; /* eq 3.13 */
 }
 
 /* The Gaussian as a sum of its images or, where it is wide, as its Fourier series: at sigma = 1/4 both need six
@@ -2241,14 +2253,14 @@ static double metroi_gaussian_density(double sigma, double d)
 
 /* The Cauchy images add up to a Poisson kernel, with q = exp(-2 pi gamma):
 
-       P(d) = frac{(1 - q)(1 + q)}{(1 - q)^2 + 4 q sin^2(pi d)}                       (3.13)
+       P(d) = frac{(1 - q)(1 + q)}{(1 - q)^2 + 4 q sin^2(pi d)}                       (3.14)
 
    which we divide through by 1 - q, so that nothing underflows for a tiny gamma. */
 
 static double metroi_cauchy_density(double gamma, double d)
 {
     double q = exp(-2 * METROI_PI * gamma), gap = -expm1(-2 * METROI_PI * gamma), s = sin(METROI_PI * d);
-    return (1 + q) / (gap + 4 * q * (s * s / gap)); /* eq 3.13 */
+    return (1 + q) / (gap + 4 * q * (s * s / gap)); /* eq 3.14 */
 }
 
 static double metroi_von_mises_density(double kappa, double d)
@@ -2314,7 +2326,7 @@ METRO_API double metro_kernel_density(const metro_kernel *k, double from, double
 /* On the interval a step from x to y goes straight or by way of the mirror image -y; on the circle of length 2 those
    are two points, and their densities add up:
 
-       P(x -> y) = C(y - x) + C(y + x), C the kernel on the circle of length 2        (3.14)
+       P(x -> y) = C(y - x) + C(y + x), C the kernel on the circle of length 2        (3.15)
 
    Both distances are the same, to the last bit, when x and y change places. */
 
@@ -2323,7 +2335,7 @@ METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from
     if (!metroi_kernel_valid(k) || k->shape == METRO_VON_MISES || !isfinite(from) || !isfinite(to)) return METROI_NAN;
     from = fabs(from - 2 * rint(from / 2));
     to = fabs(to - 2 * rint(to / 2));
-    return metroi_circle_density(k, to - from, 2) + metroi_circle_density(k, to + from, 2); /* eq 3.14 */
+    return metroi_circle_density(k, to - from, 2) + metroi_circle_density(k, to + from, 2); /* eq 3.15 */
 }
 
 /* # 3.9 Directions
@@ -2380,7 +2392,7 @@ METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_ve
 /* The von Mises-Fisher density e^{kappa cos theta} is an exponential in t = 1 - cos(theta), cut off at 2. Its
    distribution function has an inverse (Ulrich 1984; Jakob 2012 for the form that does not overflow):
 
-       t = -frac{1}{kappa} ln(1 - u (1 - e^{-2 kappa})), u uniform                    (3.15)
+       t = -frac{1}{kappa} ln(1 - u (1 - e^{-2 kappa})), u uniform                    (3.16)
 
    and per steradian it is frac{kappa}{2 pi (1 - e^{-2 kappa})} e^{-kappa t}. Below kappa = 1e-17 it is uniform to the
    last bit. */
@@ -2388,7 +2400,7 @@ METRO_API double metro_cone_density(double half_angle, metro_vec3 from, metro_ve
 METRO_API metro_vec3 metro_vmf_perturb(double kappa, metro_vec3 from, metro_rng *rng)
 {
     double u = metro_rng_uniform(rng);
-    double t = kappa < 1e-17 ? 2 * u : -log1p(u * expm1(-2 * kappa)) / kappa; /* eq 3.15 */
+    double t = kappa < 1e-17 ? 2 * u : -log1p(u * expm1(-2 * kappa)) / kappa; /* eq 3.16 */
     if (!(kappa >= 0 && isfinite(kappa))) t = METROI_NAN;
     return metroi_direction_turn(from, t, rng);
 }
@@ -2405,18 +2417,18 @@ METRO_API double metro_vmf_density(double kappa, metro_vec3 from, metro_vec3 to)
    A kernel that depends on the angle alone multiplies every spherical harmonic of degree l by the same number
    lambda_l, its Legendre coefficient (Funk 1915, Hecke 1918). For the cone,
 
-       lambda_l = frac{P_{l-1}(c) - P_{l+1}(c)}{(2l+1)(1 - c)}, c = cos(alpha)        (3.16)
+       lambda_l = frac{P_{l-1}(c) - P_{l+1}(c)}{(2l+1)(1 - c)}, c = cos(alpha)        (3.17)
 
-   and for a narrow cone eq 3.16 is 0/0. With w = 1 - c = 2 sin^2(alpha/2), h = cos^2(alpha/2) and lambda_{i+1} = h
+   and for a narrow cone eq 3.17 is 0/0. With w = 1 - c = 2 sin^2(alpha/2), h = cos^2(alpha/2) and lambda_{i+1} = h
    C_i, the recurrence of the Legendre polynomials becomes one for the differences D_i = C_i - C_{i-1}, where nothing
    cancels:
 
-       D_{i+1} = frac{i D_i - (2i+3) w C_i}{i + 3}, C_{i+1} = C_i + D_{i+1}, C_0 = 1, D_0 = 0       (3.17)
+       D_{i+1} = frac{i D_i - (2i+3) w C_i}{i + 3}, C_{i+1} = C_i + D_{i+1}, C_0 = 1, D_0 = 0       (3.18)
 
    We carry 1 - C, so that chapter 5 has the logarithm of C as well. A cone wider than pi/2 is the whole sphere less a
    narrow cone around the other pole, so
 
-       lambda_l(alpha) = (-1)^{l+1} cot^2(alpha/2) lambda_l(pi - alpha)               (3.18)
+       lambda_l(alpha) = (-1)^{l+1} cot^2(alpha/2) lambda_l(pi - alpha)               (3.19)
 
    which also keeps the digits of a cone close to the whole sphere. */
 
@@ -2435,7 +2447,7 @@ static metroi_cone metroi_cone_start(double height)
 
 static void metroi_cone_next(metroi_cone *cone)
 {
-    cone->d = (cone->i * cone->d - (2 * cone->i + 3) * cone->w * (1 - cone->gap)) / (cone->i + 3); /* eq 3.17 */
+    cone->d = (cone->i * cone->d - (2 * cone->i + 3) * cone->w * (1 - cone->gap)) / (cone->i + 3); /* eq 3.18 */
     cone->gap -= cone->d;
     cone->i++;
 }
@@ -2450,7 +2462,7 @@ METRO_API double metro_cone_coefficient(double half_angle, int degree)
     while (cone.i + 1 < degree) metroi_cone_next(&cone);
     h = cos(0.5 * angle);
     if (half_angle <= 0.5 * METROI_PI) return h * h * (1 - cone.gap);
-    t = sin(0.5 * angle); /* eq 3.18: cot(alpha/2) = tan((pi - alpha)/2), and cos^2 cancels */
+    t = sin(0.5 * angle); /* eq 3.19: cot(alpha/2) = tan((pi - alpha)/2), and cos^2 cancels */
     return (degree % 2 ? t * t : -t * t) * (1 - cone.gap);
 }
 
@@ -2876,7 +2888,7 @@ METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t can
 /* # 4.7 Burn-in and the normalisation
 
    A burn-in throws the first samples away. That lowers the bias, and it raises the variance, since fewer samples are
-   left to average. Which wins is computed in section 5.18 for constant importance, and measured in the example
+   left to average. Which wins is computed in section 5.19 for constant importance, and measured in the example
    `startup`.
 
    [figure: startup.svg | All start-up policies at equal cost: squared bias and variance of a small picture against
@@ -3111,12 +3123,21 @@ static double metroi_spectrum_log(const metroi_spectrum *spectrum, double k, int
 
    The first line bounds Ci(b) by 1/b and Ci(a) by its series or, beyond its first zero, by its largest value. The
    second is 1 - cos y >= 2 y^2/pi^2, true to y = pi. Up to the frequency 2 C there are at most 2 C T modes, none
-   above X.
+   above X. Nearly equal sizes, w = s2 - s1 < s1, make that bound useless, since their modes come back to almost 1 for
+   many k; but abs(P) is at most the modulus of the transform of the positive steps alone, and the same inequality for
+   their differences says
+
+       X(f) = max(2 w C, e^{-2 (q f w)^2/3}) "for" f < frac{1}{2 w}, q = frac{w}{L s2}      (5.12)
+
+   If s1 and s2 are whole or half numbers, all sines vanish and with them the first order of Ci, and there is much
+   less to come:
+
+       abs(P(k)) <= frac{1}{4 pi^2 L k^2} (frac{1}{s1^2} + frac{1}{s2^2})             (5.13)
 
    For the other kernels ln P is concave in k: each ratio of neighbours is below the last one, and a geometric series
    bounds the rest,
 
-       sum_{j>k} P_j^s <= P_k^s frac{r}{1 - r}, r = (P_k/P_{k-1})^s                   (5.12) */
+       sum_{j>k} P_j^s <= P_k^s frac{r}{1 - r}, r = (P_k/P_{k-1})^s                   (5.14) */
 
 static double metroi_kelemen_bound(const metro_kernel *k)
 {
@@ -3135,16 +3156,23 @@ static double metroi_sinc_tail(double h, double s, double k)
 /* ln X(f) */
 static double metroi_kelemen_ceiling(const metro_kernel *k, double f)
 {
-    double s1 = k->size_min, s2 = k->size, l = metroi_kelemen_log(s1, s2), g = fmax(f, 0.5 / s2);
-    double a = 2 * METROI_PI * g * s1, b = 2 * METROI_PI * g * s2;
+    double s1 = k->size_min, s2 = k->size, l = metroi_kelemen_log(s1, s2), g = fmax(f, 0.5 / s2), w = s2 - s1;
+    double a = 2 * METROI_PI * g * s1, b = 2 * METROI_PI * g * s2, q = w / s2 / l;
     double bell = -4 * (f * s2) * (f * s2 - f * s1 * (s1 / s2)) / l;
     double ceiling = fmin(1 / b + fmax(0.48, -log(a) - 0.577 + 0.25 * a * a), 1 / a + 1 / b) / l;
+    if (w < s1 && f * w < 0.5) /* eq 5.12 */
+        return fmin(0, fmax(-2 * (q * f * w) * (q * f * w) / 3, log(2 * w * metroi_kelemen_bound(k))));
     return f < g ? fmax(bell, log(ceiling)) : log(ceiling); /* eq 5.11 */
 }
 
 static double metroi_kelemen_tail(const metro_kernel *k, double period, double s, double mode)
 {
     double edge = 2 * metroi_kelemen_bound(k) * period, far = mode > edge ? mode : edge, near;
+    if (period == 1 && fmod(2 * k->size, 1) == 0 && fmod(2 * k->size_min, 1) == 0) {
+        near = (1 / (k->size * k->size) + 1 / (k->size_min * k->size_min))
+             / (4 * METROI_PI * METROI_PI * metroi_kelemen_log(k->size_min, k->size));
+        return s * (log(near) - 2 * log(mode)) + log(mode / (2 * s - 1)); /* eq 5.13 */
+    }
     far = s * log(0.5 * edge / far) + log(far / (s - 1));
     if (mode > edge) return far;
     near = log(edge) + s * metroi_kelemen_ceiling(k, mode / period);
@@ -3165,28 +3193,30 @@ static double metroi_spectrum_tail(const metroi_spectrum *spectrum, double s, do
     case METRO_VON_MISES: break;
     }
     if (at == -METROI_INFINITY) return at;
-    return s * at + ratio - log(-expm1(ratio)); /* eq 5.12 */
+    return s * at + ratio - log(-expm1(ratio)); /* eq 5.14 */
 }
 
 /* # 5.5 The sum over modes
 
    One loop serves them all:
 
-       S = sum_{k=1}^{inf} P(k/T)^s w_k, w_k = cos(2 pi k x/T) "or" abs(A_k)^2        (5.13)
+       S = sum_{k=1}^{inf} P(k/T)^s w_k, w_k = cos(2 pi k x/T) "or" abs(A_k)^2        (5.15)
 
-   The weights are those of a point x, or those of a set of seeds (section 5.11). Beside S we keep S', the same sum of
+   The weights are those of a point x, or those of a set of seeds (section 5.12). Beside S we keep S', the same sum of
    abs(P)^s with all weights 1, which belongs to a single seed. We stop where the rest is below 1e-14 S. Seeds that
    cancel each other make S so small that this may never come; so from 64 terms on 1e-14 sqrt(S S') is enough, which
    holds the error of E_n below 1e-14 of what one seed has, and 1e-26 S' for seeds that cancel all. Bounds cost more
    than terms; after the first 16 terms we look at every eighth.
 
-   For Kelemen's kernel at small s the terms fall slowly. After 50000 of them it has to be content with 1e-9, and
-   where ten times as many do not give that the answer is NaN.
+   For Kelemen's kernel the terms may fall slowly. After 5000 of them section 5.10 has a better way. Where that does
+   not apply, we are content with 1e-9 after 50000, and where ten times as many would not give that, the answer is NaN
+   at once.
 
    [figure: accuracy.svg | What accuracy costs: error against time for the series and the library, the operator, an
    ensemble, and the size of the perturbation.] */
 
-#define METROI_PATIENCE 5e4
+#define METROI_PATIENCE 5000.0
+#define METROI_RESIGNATION 500000.0
 
 typedef struct {
     const double *point, *alpha; /* alpha NULL: equal weights */
@@ -3194,12 +3224,36 @@ typedef struct {
 } metroi_seeds;
 
 static double metroi_seed_power(const metroi_seeds *seeds, double k);
+static double metroi_seed_weight(const metroi_seeds *seeds, size_t i);
+static double metroi_circle_distance(double x, double y);
+
+/* What section 5.10 wants to know of a sum over modes: the terms as a function of ln abs(P) and the sign of P, the
+   largest power of P in them, and the logarithm of a bound on all terms beyond mode k. `mean` is for the running mean
+   of section 5.15. */
+typedef struct metroi_far_terms metroi_far_terms;
+struct metroi_far_terms {
+    metroi_spectrum spectrum;
+    double steps;
+    const void *mean;
+    double (*term)(const metroi_far_terms *terms, double at, int sign);
+    double (*rest)(const metroi_far_terms *terms, double k);
+};
+
+static int metroi_far_applies(const metro_kernel *k, double s, double period);
+static double metroi_far_series(const metroi_far_terms *terms, double x, const metroi_seeds *seeds);
 
 /* The logarithm of the tolerance at term k, relative to the sum. */
 static double metroi_series_tolerance(const metroi_spectrum *spectrum, double k)
 {
-    if (spectrum->kernel.shape != METRO_KELEMEN || k < METROI_PATIENCE) return log(1e-14);
-    return k < 10 * METROI_PATIENCE ? log(1e-9) : METROI_NAN;
+    return log(spectrum->kernel.shape != METRO_KELEMEN || k < 0.1 * METROI_RESIGNATION ? 1e-14 : 1e-9);
+}
+
+/* Whether the sum must be given up at term k: `last` bounds the rest at the last term we are willing to add. */
+static int metroi_series_fails(const metroi_spectrum *spectrum, double s, double k, double last, double total)
+{
+    if (spectrum->kernel.shape != METRO_KELEMEN || k < METROI_PATIENCE) return 0;
+    if (metroi_far_applies(&spectrum->kernel, s, spectrum->period)) return 1;
+    return k > METROI_RESIGNATION || !(last <= log(1e-9) + total);
 }
 
 static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, int odd, double x,
@@ -3212,11 +3266,13 @@ static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, in
         before = at;
         at = metroi_spectrum_log(spectrum, k, &sign);
         weight = seeds != NULL ? metroi_seed_power(seeds, k) : metroi_cos_pi(2 * k, x / spectrum->period);
-        metroi_scaled_add(&sum, odd && sign < 0 ? -weight : weight, s * at); /* eq 5.13 */
+        metroi_scaled_add(&sum, odd && sign < 0 ? -weight : weight, s * at); /* eq 5.15 */
         metroi_scaled_add(&whole, 1, s * at);
         if (k > 16 && fmod(k, 8) > 0) continue;
+        rest = metroi_spectrum_tail(spectrum, s, METROI_RESIGNATION, at, before);
+        if (metroi_series_fails(spectrum, s, k, rest, metroi_scaled_log(whole)))
+            return metroi_scaled_make(METROI_NAN, 0);
         tolerance = metroi_series_tolerance(spectrum, k);
-        if (isnan(tolerance)) return metroi_scaled_make(tolerance, 0);
         rest = metroi_spectrum_tail(spectrum, s, k, at, before);
         if (rest <= tolerance + metroi_scaled_log(sum)) break;
         if (k < 64) continue;
@@ -3232,7 +3288,7 @@ static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, in
    negligible beyond the distance r, its reach, then on a circle of length T = x + r no copy of p_s reaches x but its
    own, and eq 5.5 on that circle, scaled back to the line, reads
 
-       p_s(x) = frac{1}{T} (1 + 2 sum_{k=1}^{inf} P(k/T)^s cos(2 pi k x/T)), x + r <= T <= 1      (5.14)
+       p_s(x) = frac{1}{T} (1 + 2 sum_{k=1}^{inf} P(k/T)^s cos(2 pi k x/T)), x + r <= T <= 1      (5.16)
 
    Its terms are spaced by 1/T, so there are fewer by the factor T. With the smallest T that is allowed, some twenty
    terms are enough for every size and every number of steps.
@@ -3242,7 +3298,7 @@ static metroi_scaled metroi_series(const metroi_spectrum *spectrum, double s, in
    of x. For uniform steps of width g the variance g^2/12 takes the place of c^2 in that bound, because (sinh y)/y <=
    exp(y^2/6); A = 48 gives
 
-       r = g min(s/2, 1/2 + sqrt{8 s})                                                (5.15)
+       r = g min(s/2, 1/2 + sqrt{8 s})                                                (5.17)
 
    Kelemen's density is unbounded by comparison, 1/(2 L s1), and A = 72 pays for that. A Gaussian is left at 9 of its
    standard deviations, sigma sqrt(s). A von Mises density of concentration 1000 or more is nearly one, with sigma =
@@ -3253,7 +3309,7 @@ static double metroi_reach(const metro_kernel *k, double s)
 {
     double c = k->size;
     switch (k->shape) {
-    case METRO_UNIFORM: return c * (s < 34 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.15 */
+    case METRO_UNIFORM: return c * (s < 34 ? s / 2 : 0.5 + sqrt(8 * s)); /* eq 5.17 */
     case METRO_TRIANGLE: return 0.5 * c * (s < 17 ? s : 0.5 + sqrt(16 * s));
     case METRO_GAUSSIAN: return 9 * c * sqrt(s);
     case METRO_VON_MISES: return c < METROI_DEBYE ? METROI_INFINITY : 9 * sqrt(s / c) / (2 * METROI_PI);
@@ -3261,6 +3317,31 @@ static double metroi_reach(const metro_kernel *k, double s)
     case METRO_CAUCHY: break;
     }
     return METROI_INFINITY;
+}
+
+/* The sum of eq 5.15 of a power of P, and where it was given up, that of section 5.10. */
+
+static double metroi_power_term(const metroi_far_terms *terms, double at, int sign)
+{
+    double value = exp(terms->steps * at);
+    return sign < 0 && fmod(terms->steps, 2) > 0 ? -value : value;
+}
+
+static double metroi_power_rest(const metroi_far_terms *terms, double k)
+{
+    return metroi_kelemen_tail(&terms->spectrum.kernel, terms->spectrum.period, terms->steps, k);
+}
+
+static double metroi_far_power(const metro_kernel *k, double period, double s, double x, const metroi_seeds *seeds)
+{
+    metroi_far_terms terms;
+    if (k->shape != METRO_KELEMEN || !metroi_far_applies(k, s, period)) return METROI_NAN;
+    metroi_spectrum_make(k, period, &terms.spectrum);
+    terms.steps = s;
+    terms.mean = NULL;
+    terms.term = metroi_power_term;
+    terms.rest = metroi_power_rest;
+    return metroi_far_series(&terms, x, seeds);
 }
 
 /* e_s(x) by modes, on the shorter circle where there is one; eq 5.9, 0 <= x <= 1/2. */
@@ -3272,7 +3353,11 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
     if (x >= reach) return metroi_scaled_make(-1, 0);
     metroi_spectrum_make(k, period, &spectrum);
     sum = metroi_series(&spectrum, s, odd, x, NULL);
-    if (period < 1) return metroi_scaled_make((1 + 2 * metroi_scaled_value(sum)) / period - 1, 0); /* eq 5.14 */
+    if (isnan(sum.factor)) {
+        period = 1.25 * (x + reach) < 1 ? 1.25 * (x + reach) : 1;
+        sum = metroi_scaled_make(metroi_far_power(k, period, s, x, NULL), 0);
+    }
+    if (period < 1) return metroi_scaled_make((1 + 2 * metroi_scaled_value(sum)) / period - 1, 0); /* eq 5.16 */
     sum.factor *= 2;
     return sum;
 }
@@ -3281,17 +3366,17 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
 
    The tentative sample is uniform in an interval of width Delta around the current one,
 
-       P(x - y) = 1/Delta "for" abs(x - y) < Delta/2, "else" 0                        (5.16)
+       P(x - y) = 1/Delta "for" abs(x - y) < Delta/2, "else" 0                        (5.18)
 
    Paper (16) prints abs(x - y) < Delta, and that integrates to 2. Its transform, paper (17), is right, for Delta > 1
    too:
 
-       P*(k) = frac{sin(pi k Delta)}{pi k Delta}                                      (5.17)
+       P*(k) = frac{sin(pi k Delta)}{pi k Delta}                                      (5.19)
 
    Size and steps. The first mode forgets last; -1/ln P*(1) steps reduce it by the factor e, and for small Delta that
    is
 
-       tau = -frac{1}{ln P*(1)} ~ frac{6}{pi^2 Delta^2}                               (5.18)
+       tau = -frac{1}{ln P*(1)} ~ frac{6}{pi^2 Delta^2}                               (5.20)
 
    The paper's section 2.3 asks for much more than 1/Delta steps, but a random walk covers distance by the square root
    of its steps: after 10/Delta of them the error is still .27 for Delta = .1, 1.45 for .01 and 2.96 for .001.
@@ -3301,24 +3386,24 @@ static metroi_scaled metroi_excess_series(const metro_kernel *k, double s, int o
    1/2. Since sin(pi k Delta) = (-1)^{k m} sin(pi k d), the coefficients are those of a narrow kernel U_g, times
    d/Delta, up to signs, and the signs are a shift by m/2:
 
-       e_s(x) = (d/Delta)^s e_s(U_g; x + s m/2)                                       (5.19)
+       e_s(x) = (d/Delta)^s e_s(U_g; x + s m/2)                                       (5.21)
 
    In particular E_n(Delta) = (g/Delta)^n E_n(U_g), exactly 0 at d = 0, with all its digits beside it. It also means
    that we need only sizes up to 1/2.
 
    Few steps. The density of a sum of s uniform steps of width 1 is the B-spline B_s of order s, and wrapping it gives
 
-       p_s(U_g; x) = frac{1}{g} sum_{m} B_s((x - m)/g)                                (5.20)
+       p_s(U_g; x) = frac{1}{g} sum_{m} B_s((x - m)/g)                                (5.22)
 
    Its explicit formula is an alternating sum, useless from s = 20 on. The recurrence adds positive numbers only (Cox
    1972; de Boor 1972), centred:
 
        B_s(y) = frac{(s/2 + y) B_{s-1}(y + 1/2) + (s/2 - y) B_{s-1}(y - 1/2)}{s - 1}
-       B_1(y) = 1 "for" abs(y) < 1/2, "and" 1/2 "at the ends"                         (5.21)
+       B_1(y) = 1 "for" abs(y) < 1/2, "and" 1/2 "at the ends"                         (5.23)
 
    With eq 5.8 the first errors are E_1^2 = (1 - g)/g and E_2^2 = (2 - 3 g)/(3 g). Splines serve for s <= 10, and on
    to 24 as long as the chain has not gone around the circle; then 1 does not cancel from p_s. Beyond, the modes decay
-   fast and eq 5.13 or eq 5.14 takes over.
+   fast and eq 5.15 or eq 5.16 takes over.
 
    [figure: fig2.svg | The start-up error against the number of steps for perturbations of different width, with
    estimates from ensembles of chains (figure 2 of the paper).] */
@@ -3337,7 +3422,7 @@ static double metroi_spline(int order, double y)
     for (r = 2; r <= order; r++) {
         for (j = 0; j <= order - r; j++) {
             t = y + 0.5 * (order - r) - j;
-            b[j] = ((0.5 * r + t) * b[j] + (0.5 * r - t) * b[j + 1]) / (r - 1); /* eq 5.21 */
+            b[j] = ((0.5 * r + t) * b[j] + (0.5 * r - t) * b[j + 1]) / (r - 1); /* eq 5.23 */
         }
     }
     return b[0];
@@ -3350,7 +3435,7 @@ static metroi_scaled metroi_narrow_excess(double g, double s, int odd, double x)
     double sum = 0, m;
     if (s <= 10 || (s <= METROI_SPLINE_ORDER && s * g <= 1.5)) {
         for (m = ceil(x - 0.5 * s * g); m <= x + 0.5 * s * g; m++) sum += metroi_spline((int)s, (x - m) / g);
-        return metroi_scaled_make((sum - g) / g, 0); /* eq 5.20 */
+        return metroi_scaled_make((sum - g) / g, 0); /* eq 5.22 */
     }
     narrow.shape = METRO_UNIFORM;
     narrow.size = g;
@@ -3370,7 +3455,7 @@ static metroi_scaled metroi_uniform_excess(double size, double s, int odd, doubl
     metroi_scaled e;
     if (d == 0) return metroi_scaled_make(0, 0);
     if (m == 0) return metroi_narrow_excess(g, s, odd, x);
-    e = metroi_narrow_excess(g, s, odd, odd && fmod(m, 2) > 0 ? 0.5 - x : x); /* eq 5.19 */
+    e = metroi_narrow_excess(g, s, odd, odd && fmod(m, 2) > 0 ? 0.5 - x : x); /* eq 5.21 */
     e.log += s * metroi_turn_log(size, g);
     if (odd && d < 0) e.factor = -e.factor;
     return e;
@@ -3379,7 +3464,7 @@ static metroi_scaled metroi_uniform_excess(double size, double s, int odd, doubl
 /* A triangular step of base Delta is the sum of two uniform steps of width Delta/2, so s triangular steps are 2 s
    uniform ones:
 
-       e_s("triangle", Delta; x) = e_{2s}("uniform", Delta/2; x)                      (5.22)
+       e_s("triangle", Delta; x) = e_{2s}("uniform", Delta/2; x)                      (5.24)
 
    # 5.8 Gaussian, Cauchy and von Mises perturbations
 
@@ -3387,7 +3472,7 @@ static metroi_scaled metroi_uniform_excess(double size, double s, int odd, doubl
    and the two agree by Poisson's formula:
 
        e_s(x) = 2 sum_{k=1}^{inf} e^{-2 pi^2 V k^2} cos(2 pi k x)
-       e_s(x) = frac{1}{sqrt{2 pi V}} sum_{m=-inf}^{inf} e^{-(x-m)^2/(2V)} - 1        (5.23)
+       e_s(x) = frac{1}{sqrt{2 pi V}} sum_{m=-inf}^{inf} e^{-(x-m)^2/(2V)} - 1        (5.25)
 
    We change over at 2 pi^2 V = 1, where both need six terms. */
 
@@ -3397,7 +3482,7 @@ static metroi_scaled metroi_gaussian_excess(double sigma, double s, double x)
     if (a > 1) {
         sum = metroi_cos_pi(2, x);
         for (k = 2; k <= 7; k++) sum += exp(-a * (k * k - 1)) * metroi_cos_pi(2 * k, x);
-        return metroi_scaled_make(2 * sum, -a); /* eq 5.23 */
+        return metroi_scaled_make(2 * sum, -a); /* eq 5.25 */
     }
     for (k = -3; k <= 3; k++) sum += exp(-0.5 * ((x - k) / deviation) * ((x - k) / deviation));
     return metroi_scaled_make(sum / (sqrt(2 * METROI_PI) * deviation) - 1, 0);
@@ -3406,17 +3491,17 @@ static metroi_scaled metroi_gaussian_excess(double sigma, double s, double x)
 /* Cauchy steps add their scales, and with q = exp(-2 pi gamma s) the series is geometric:
 
        e_s(x) = frac{2 q (cos(2 pi x) - q)}{(1 - q)^2 + 4 q sin^2(pi x)}
-       E_n^2 = frac{2}{e^{4 pi gamma n} - 1}                                          (5.24) */
+       E_n^2 = frac{2}{e^{4 pi gamma n} - 1}                                          (5.26) */
 
 static metroi_scaled metroi_cauchy_excess(double gamma, double s, double x)
 {
     double a = 2 * METROI_PI * gamma * s, q = exp(-a), gap = -expm1(-a);
     double sine = sin(METROI_PI * x), t = sine * sine / gap;
-    return metroi_scaled_make(2 * (1 - 2 * t) / (gap + 4 * q * t), -a); /* eq 5.24 */
+    return metroi_scaled_make(2 * (1 - 2 * t) / (gap + 4 * q * t), -a); /* eq 5.26 */
 }
 
 /* Von Mises steps on the circle do not stay von Mises; their coefficients I_k(kappa)/I_0(kappa) come from chapter 3,
-   and eq 5.13 adds them.
+   and eq 5.15 adds them.
 
    # 5.9 Kelemen's perturbations
 
@@ -3426,18 +3511,19 @@ static metroi_scaled metroi_cauchy_excess(double gamma, double s, double x)
        R(x) = frac{1}{2 L^2 x} (T + U), R(0) = frac{s2 - s1}{2 L^2 s1 s2}
        T = ln(1 + frac{x - 2 s1}{s1}) "for" 2 s1 < x < s1 + s2
        T = ln(1 + frac{2 s2 - x}{x - s2}) "for" s1 + s2 <= x < 2 s2, "else" 0
-       U = ln(1 + frac{x (s2 - s1 - x)}{s1 s2}) "for" x < s2 - s1, "else" 0           (5.25)
+       U = ln(1 + frac{x (s2 - s1 - x)}{s1 s2}) "for" x < s2 - s1, "else" 0           (5.27)
 
    where T belongs to two steps in the same direction and U to opposite ones. Three and four steps are integrals over
    R,
 
-       p_3(z) = int R(y) P(z - y) dy, p_4(z) = int R(y) R(z - y) dy                   (5.26)
+       p_3(z) = int R(y) P(z - y) dy, p_4(z) = int R(y) R(z - y) dy                   (5.28)
 
    whose integrands are smooth between the kinks at +-(0, 2 s1, s2 - s1, s1 + s2, 2 s2) and those of the other factor.
    They change over lengths of the order of s1 beside a kink and more slowly away from it. So we cut each piece into
    panels of length s1, 2 s1, 4 s1, ... inward from both ends and give each panel the 24-point Gauss rule. Five steps
-   and more are left to the series, on the short circle of eq 5.14, and so are four steps of a kernel that goes around
-   the circle many times. At two and three steps each turn is one term more; we stop at sizes of 10000, with NaN. */
+   and more are left to the series, on the short circle of eq 5.16, and so are three and four steps of a kernel that
+   goes around the circle so often that the series is the shorter sum. At two steps each turn is one term more; we
+   stop at sizes of 10000, with NaN. */
 
 #define METROI_WIDEST 1e4
 
@@ -3446,12 +3532,14 @@ static double metroi_kelemen_pair(const metro_kernel *k, double x)
     double s1 = k->size_min, s2 = k->size, l = metroi_kelemen_log(s1, s2), sum = 0;
     x = fabs(x);
     if (x == 0) return (s2 - s1) / s1 / (2 * l * l * s2);
-    if (x > 2 * s1 && x < 2 * s2) sum += x < s1 + s2 ? log1p((x - 2 * s1) / s1) : log1p((2 * s2 - x) / (x - s2));
+    /* x - s2 is at least s1, even where s1 + s2 rounds to s2 */
+    if (x > 2 * s1 && x < 2 * s2)
+        sum += x < s1 + s2 ? log1p((x - 2 * s1) / s1) : log1p((2 * s2 - x) / fmax(x - s2, s1));
     if (x < s2 - s1) sum += log1p(x / s1 * ((s2 - s1 - x) / s2));
-    return sum / (2 * l * l * x); /* eq 5.25 */
+    return sum / (2 * l * l * x); /* eq 5.27 */
 }
 
-/* The second factor of eq 5.26, for s = 3 and s = 4. */
+/* The second factor of eq 5.28, for s = 3 and s = 4. */
 static double metroi_kelemen_factor(const metro_kernel *k, double s, double u)
 {
     if (s > 3) return metroi_kelemen_pair(k, u);
@@ -3484,11 +3572,23 @@ static double metroi_kelemen_piece(const metro_kernel *k, double s, double z, do
     return sum;
 }
 
-/* p_3 or p_4 on the line, eq 5.26. */
+static void metroi_kinks_sort(double *kink, int count)
+{
+    double t;
+    int i, j;
+    for (i = 1; i < count; i++)
+        for (j = i; j > 0 && kink[j - 1] > kink[j]; j--) {
+            t = kink[j];
+            kink[j] = kink[j - 1];
+            kink[j - 1] = t;
+        }
+}
+
+/* p_3 or p_4 on the line, eq 5.28. */
 static double metroi_kelemen_line(const metro_kernel *k, double s, double z)
 {
-    double s1 = k->size_min, s2 = k->size, kink[20], place[5], sum = 0, low, high, t;
-    int count = 0, i, j;
+    double s1 = k->size_min, s2 = k->size, kink[20], place[5], sum = 0, low, high;
+    int count = 0, i;
     place[0] = 0;
     place[1] = 2 * s1;
     place[2] = s2 - s1;
@@ -3501,12 +3601,7 @@ static double metroi_kelemen_line(const metro_kernel *k, double s, double z)
         kink[count++] = z + place[i];
         kink[count++] = z - place[i];
     }
-    for (i = 1; i < count; i++)
-        for (j = i; j > 0 && kink[j - 1] > kink[j]; j--) {
-            t = kink[j];
-            kink[j] = kink[j - 1];
-            kink[j - 1] = t;
-        }
+    metroi_kinks_sort(kink, count);
     low = fmax(-2 * s2, z - (s - 2) * s2);
     high = fmin(2 * s2, z + (s - 2) * s2);
     for (i = 1; i < count; i++)
@@ -3515,23 +3610,459 @@ static double metroi_kelemen_line(const metro_kernel *k, double s, double z)
     return sum;
 }
 
+/* Nearly equal sizes. With w = s2 - s1 small, the steps are two narrow packets, at s1 and at -s1, and what happens
+   around their sums happens over lengths of w. Differences of places would lose the digits that w does not share with
+   s1. So a place is counted from the packet that it belongs to. R is the sum of three packets,
+
+       R(x) = sum_{a=-1}^{1} R_a(x - 2 a s1)
+       R_1(y) = R_{-1}(-y) = frac{T}{2 L^2 (2 s1 + y)}, R_0(y) = frac{U}{2 L^2 abs(y)}
+       T = ln(1 + frac{y}{s1}) "for" 0 < y < w, ln(1 + frac{2 w - y}{s1 + y - w}) "for" w <= y < 2 w
+       U = ln(1 + frac{abs(y) (w - abs(y))}{s1 s2}) "for" abs(y) < w                  (5.29)
+
+   and a single step of P_1(y) = P_{-1}(-y) = 1/(2 L (s1 + y)), 0 <= y <= w, and then
+
+       p_3(z) = sum_{a,b} int R_a(y) P_b(z - (2 a + b) s1 - y) dy
+       p_4(z) = sum_{a,b} int R_a(y) R_b(z - 2 (a + b) s1 - y) dy                     (5.30)
+
+   with whole turns taken off z - 2 a s1 exactly, as in eq 3.2. Between the kinks, which are w apart, each factor is
+   so smooth for s2 < 2 s1 that 24 Gauss points do for a piece. */
+
+/* One factor: the packet `a` of two steps, or (`one`) of one. */
+static double metroi_packet(const metro_kernel *k, int one, int a, double y)
+{
+    double s1 = k->size_min, w = k->size - s1, l = metroi_kelemen_log(s1, k->size);
+    if (a < 0) y = -y;
+    if (one) return y < 0 || y > w ? 0 : 1 / (2 * l * (s1 + y));
+    if (a == 0) {
+        y = fabs(y);
+        if (y == 0) return w / s1 / (2 * l * l * k->size);
+        return y >= w ? 0 : log1p(y / s1 * ((w - y) / k->size)) / (2 * l * l * y);
+    }
+    if (y <= 0 || y >= 2 * w) return 0;
+    return log1p(y < w ? y / s1 : (2 * w - y) / (s1 + (y - w))) / (2 * l * l * (2 * s1 + y)); /* eq 5.29 */
+}
+
+/* int R_a(y) Q(z - y) dy, Q = R_b or P_b, piece by piece between the kinks of both. */
+static double metroi_packets_meet(const metro_kernel *k, int one, int a, int b, double z)
+{
+    double w = k->size - k->size_min, first = (a - 1) * w, last = z - (one ? 0.5 * (b - 1) : b - 1) * w;
+    double kink[6], sum = 0, weight, y, t;
+    int count = one ? 5 : 6, i, j;
+    for (i = 0; i < count; i++) kink[i] = i < 3 ? first + i * w : last - (i - 3) * w;
+    metroi_kinks_sort(kink, count);
+    for (i = 1; i < count; i++) {
+        t = kink[i] - kink[i - 1];
+        for (j = 0; j < 24 && t > 0; j++) {
+            y = kink[i - 1] + t * metroi_gauss24(j, &weight);
+            sum += weight * t * metroi_packet(k, 0, a, y) * metroi_packet(k, one, b, z - y);
+        }
+    }
+    return sum;
+}
+
+/* p_3(x) or p_4(x) on the circle, eq 5.30. */
+static double metroi_packets(const metro_kernel *k, int one, double x)
+{
+    double w = k->size - k->size_min, sum = 0, p, e, low, high, turns, m;
+    int a, b;
+    for (a = -1; a <= 1; a++)
+        for (b = -1; b <= 1; b += one ? 2 : 1) {
+            turns = one ? 2 * a + b : 2 * (a + b);
+            p = turns * k->size_min;
+            e = fma(turns, k->size_min, -p);
+            p = x - (p - rint(p)) - e; /* eq 3.2 */
+            low = (one ? a - 1 + 0.5 * (b - 1) : a + b - 2) * w;
+            high = low + (one ? 3 : 4) * w;
+            for (m = ceil(low - p); m <= high - p; m++) sum += metroi_packets_meet(k, one, a, b, p + m);
+        }
+    return sum;
+}
+
+/* Whether the integrals serve three and four steps. Not where many turns, each of some 2 + log2(s2/s1)/5 panels, take
+   longer than the series of section 5.10; not where the error is so small that 1 cancels from them; and not where by
+   C/f for a mode the series has fewer than 300 terms an integral, (1e14 C^s/(s-1))^{1/(s-1)} of them. */
+static int metroi_kelemen_few(const metro_kernel *k, double s)
+{
+    int near = k->size < 2 * k->size_min;
+    double c = metroi_kelemen_bound(k), reach = near ? s * (k->size - k->size_min) : s * k->size;
+    double panels = (1 + 2 * reach) * (7 + metroi_kelemen_log(k->size_min, k->size));
+    if (!near && (reach > 100 * c || panels > 600)) return 0;
+    return log(1e14 / (s - 1)) + s * log(c) > (s - 1) * log(300 * (1 + 2 * reach));
+}
+
 static metroi_scaled metroi_kelemen_excess(const metro_kernel *k, double s, int odd, double x)
 {
     double reach = s * k->size, m;
     metro_sum sum = { -1, 0 };
-    if (s > 4 || (s > 3 && reach > 100 * metroi_kelemen_bound(k))) return metroi_excess_series(k, s, odd, x);
-    if (k->size > METROI_WIDEST) return metroi_scaled_make(METROI_NAN, 0);
+    if (s > 4 || (s > 2 && !metroi_kelemen_few(k, s))) return metroi_excess_series(k, s, odd, x);
+    if (s == 2 && k->size > METROI_WIDEST) return metroi_scaled_make(METROI_NAN, 0);
+    if (s > 2 && k->size < 2 * k->size_min) return metroi_scaled_make(metroi_packets(k, odd, x) - 1, 0);
     for (m = ceil(x - reach); m <= x + reach; m++)
         metro_sum_add(&sum, s > 2 ? metroi_kelemen_line(k, s, x - m) : metroi_kelemen_pair(k, x - m));
     return metroi_scaled_make(metro_sum_value(&sum), 0);
 }
 
-/* # 5.10 Large steps
+/* # 5.10 Kelemen's far modes
+
+   Two kinds of Kelemen kernels have too many modes to add: those with s1 far below s2, and those with s1 and s2 close
+   to each other. Both spectra are simple far out. They are a slow part and one oscillation,
+
+       P(f) = g(f) + Re(z(f) e^{-2 pi i f c})                                         (5.31)
+
+   where g and z change little while f changes by 1/c. With a = 2 pi f s1 and b = 2 pi f s2, for s2 far above s1 eq
+   3.8 gives this with c = s2, and for nearly equal sizes (s2 < 2 s1) steps counted from s1 give it with c = s1:
+
+       g(f) = -frac{Ci(a)}{L}, z(f) = -frac{h(b)}{L}                                  (5.32)
+       g(f) = 0, z(f) = frac{h(a) - e^{-i (b-a)} h(b)}{L} = int_{0}^{1} e^{-i a (e^{L u} - 1)} du      (5.33)
+
+   By eq 5.31 a function F of P is, at each f, a periodic function of the phase 2 pi f c and has a Fourier series in
+   it. The mean over N equally spaced phases gives the coefficients, if N is more than twice the largest j that
+   matters:
+
+       F(P(f)) = sum_{j} C_j cos(j (2 pi f c - "arg" z))
+       C_j = frac{1}{N} sum_{n=0}^{N-1} F(g + abs(z) cos(2 pi n/N)) cos(2 pi j n/N)      (5.34)
+
+   The C_j of P^s for g = 0 need no such mean. They are a binomial distribution, which fades like e^{-j^2/(2s)}:
+
+       C_j = frac{s!}{((s+j)/2)! ((s-j)/2)!} 2^{-s} abs(z)^s "where" s + j "is even, else" 0      (5.35)
+
+   A sum over modes is then an integral over f, for all j that keep in step with the modes. Let chi fall smoothly from
+   1 to 0 around the mode K, f_0 = K/T. The modes weighted by chi we add. For the others Poisson's formula gives
+
+       sum_{k=1}^{inf} (1 - chi) F(P(k/T)) cos(2 pi k x/T)
+         = T sum_{j,m} int (1 - chi) C_j cos(2 pi f d - j "arg" z) df
+       d = j c - x - m T, chi(f) = frac{1}{2} "erfc"(6 (f/f_0 - 1))                   (5.36)
+
+   and a window that is so smooth leaves nothing of an oscillation that turns 16 times or more from 0 to f_0: e^{-(16
+   pi/6)^2} of it. The powers of g and z oscillate too, by c' = s1 or c' = s2 - s1 a step; that is a spread s c'
+   around each d, for many steps the reach of section 5.6 with c' for c. A pair (j, m) whose d exceeds the spread by
+   more than 16/f_0 has vanished. Few remain, always (0, 0) if x = 0: they are the packets of p_s that lie around x.
+   If d exceeds the spread by less, the integral of the pair ends by a second window where that little has turned 32
+   times; higher powers are gone at high f, and with them their spread. Otherwise it ends where eq 5.11 says that what
+   follows is below 1e-13 of the whole, or 1e-10 at three steps, where the terms fall slowly. The panels grow with f,
+   but not beyond 6/(s c') and three turns of d, and each has 24 Gauss points.
+
+   With K = 2000 sum and integral cost some milliseconds for sizes of any ratio. They take the place of the plain
+   series where that is longer than 5000 terms. The spread must stay below .4 T, so that each j has one m at most;
+   where it does not, C is small and the plain series short. K grows like s^{1/4} for nearly equal sizes, because ever
+   more j remain; at 1e12 steps we give up. N is at most 1536, which is enough for 8000 powers of P in the running
+   mean of nearly equal sizes, the one case that has more than 14 orders and no eq 5.35. */
+
+#define METROI_FAR_SAMPLES 1536
+#define METROI_FAR_BATCH 128
+#define METROI_FAR_MODES 2000.0
+
+static int metroi_far_near(const metro_kernel *k)
+{
+    return k->size < 2 * k->size_min;
+}
+
+/* c' of the text, what g and z oscillate with. */
+static double metroi_far_residue(const metro_kernel *k)
+{
+    return metroi_far_near(k) ? k->size - k->size_min : k->size_min;
+}
+
+/* How far g and z spread a packet: the reach of s steps of c', as in section 5.6. */
+static double metroi_far_spread(const metro_kernel *k, double s)
+{
+    return fmin(s, 1 + 12 * sqrt(s)) * metroi_far_residue(k);
+}
+
+/* The largest j that matters in a polynomial of degree s. Beside g the oscillation is small: 14 orders are plenty. */
+static double metroi_far_band(const metro_kernel *k, double s)
+{
+    if (!metroi_far_near(k)) return fmin(s, 14);
+    return fmin(s, floor(8.3 * sqrt(s) + 8));
+}
+
+static int metroi_far_applies(const metro_kernel *k, double s, double period)
+{
+    double least = metroi_far_near(k) ? 5 : 3;
+    return s >= least && s <= 1e12 && metroi_far_spread(k, s) < 0.4 * period;
+}
+
+/* Whether N is enough for the mean of eq 5.34. */
+static int metroi_far_fits(const metro_kernel *k, double s)
+{
+    return 2 * metroi_far_band(k, s) + 2 <= METROI_FAR_SAMPLES;
+}
+
+/* binom(s, floor(s/2))/2^s, from 100 on by Stirling's series for n = ceil(s/2). */
+static double metroi_central_binomial(double s)
+{
+    double n = ceil(0.5 * s), value = 1, i;
+    if (n >= 50) return exp((-0.125 + (1 / 192.0 - 1 / (640 * n * n)) / (n * n)) / n) / sqrt(METROI_PI * n);
+    for (i = 1; i <= n; i++) value *= (2 * i - 1) / (2 * i);
+    return value;
+}
+
+/* eq 5.32 and eq 5.33 */
+static void metroi_far_mode(const metro_kernel *k, double f, double *slow, double *re, double *im)
+{
+    double l = metroi_kelemen_log(k->size_min, k->size), a = 2 * METROI_PI * f * k->size_min, width, node, weight;
+    int i;
+    *slow = *re = *im = 0;
+    if (!metroi_far_near(k)) {
+        *slow = -metroi_cosine_integral(f, k->size_min) / l;
+        metroi_exponential_integral(2 * METROI_PI * f * k->size, re, im);
+        *re /= -l;
+        *im /= -l;
+        return;
+    }
+    width = 2 * METROI_PI * f * (k->size - k->size_min);
+    if (width < 8) {
+        for (i = 0; i < 24; i++) {
+            node = metroi_gauss24(i, &weight);
+            node = a * expm1(l * node);
+            *re += weight * cos(node);
+            *im -= weight * sin(node);
+        }
+    } else {
+        double hr, hi;
+        metroi_exponential_integral(a, re, im);
+        metroi_exponential_integral(a + width, &hr, &hi);
+        *re = (*re - cos(width) * hr - sin(width) * hi) / l;
+        *im = (*im - cos(width) * hi + sin(width) * hr) / l;
+    }
+}
+
+/* The pairs (j, m) that are integrated together, and F at the N phases of one f. */
+typedef struct {
+    const metroi_far_terms *terms;
+    int binomial; /* eq 5.35 has the C_j; `weight` holds its first two factors */
+    double edge;  /* f_0 */
+    double whole; /* the sum of abs(F) over the modes, as far as it is known */
+    double power; /* the largest power of P that matters at f */
+    double j[METROI_FAR_BATCH], d[METROI_FAR_BATCH], end[METROI_FAR_BATCH], weight[METROI_FAR_BATCH];
+    size_t count, samples;
+    double value[2][METROI_FAR_SAMPLES / 2 + 1]; /* for even and odd j */
+    double cosine[METROI_FAR_SAMPLES];
+} metroi_far;
+
+/* The phases psi and pi - psi have the same cosines for even j and opposite ones for odd j: adds them up. */
+static void metroi_far_fold(metroi_far *far)
+{
+    size_t n, half = far->samples / 2;
+    double left, right;
+    for (n = 0; 2 * n <= half; n++) {
+        left = far->value[0][n];
+        right = 2 * n < half ? far->value[0][half - n] : 0;
+        far->value[0][n] = left + right;
+        far->value[1][n] = left - right;
+    }
+}
+
+/* F at the phases 2 pi n/N, n = 0 .. N/2, each with its share of the mean; or, where eq 5.35 holds, abs(z)^s.
+   Returns the mean of abs(F), or what is near enough. */
+static double metroi_far_sample(metroi_far *far, double slow, double size)
+{
+    const metroi_far_terms *terms = far->terms;
+    double s = terms->steps, sum = 0, p, share;
+    size_t n, stride;
+    if (far->binomial) {
+        far->value[0][0] = exp(s * log(size));
+        return far->value[0][0] * metroi_central_binomial(s);
+    }
+    s = metroi_far_band(&terms->spectrum.kernel, fmin(s, far->power));
+    for (far->samples = 12; (double)far->samples < 2 * s + 2;) far->samples *= 2;
+    stride = METROI_FAR_SAMPLES / far->samples;
+    for (n = 0; 2 * n <= far->samples; n++) {
+        p = slow + size * far->cosine[n * stride];
+        share = (n == 0 || 2 * n == far->samples ? 1 : 2) / (double)far->samples;
+        far->value[0][n] = share * terms->term(terms, log(fabs(p)), p < 0 ? -1 : 1);
+        sum += fabs(far->value[0][n]);
+    }
+    metroi_far_fold(far);
+    return sum;
+}
+
+/* C_j from the samples; 0 for the j beyond them. */
+static double metroi_far_coefficient(const metroi_far *far, double j)
+{
+    const double *value = far->value[fmod(j, 2) != 0];
+    double sum = 0;
+    size_t n, at = 0, turn;
+    if (far->binomial) return far->value[0][0];
+    if (2 * fabs(j) >= (double)far->samples) return 0;
+    turn = (size_t)fabs(j) * (METROI_FAR_SAMPLES / far->samples);
+    for (n = 0; 4 * n <= far->samples; n++) {
+        sum += value[n] * far->cosine[at];
+        at += turn;
+        if (at >= METROI_FAR_SAMPLES) at -= METROI_FAR_SAMPLES;
+    }
+    return sum; /* eq 5.34 */
+}
+
+/* The integrand of eq 5.36 at f, times `width`, which is the weight of this point. */
+static double metroi_far_point(metroi_far *far, double f, double width)
+{
+    double slow, re, im, turn, sum = 0;
+    size_t i;
+    metroi_far_mode(&far->terms->spectrum.kernel, f, &slow, &re, &im);
+    turn = atan2(im, re);
+    width *= 0.5 * erfc(6 - 6 * f / far->edge);
+    far->whole += width * metroi_far_sample(far, slow, hypot(re, im));
+    for (i = 0; i < far->count; i++) {
+        if (f > 1.5 * far->end[i]) continue;
+        sum += far->weight[i] * metroi_far_coefficient(far, far->j[i])
+             * cos(2 * METROI_PI * f * far->d[i] - far->j[i] * turn) * 0.5 * erfc(12 * (f / far->end[i] - 1));
+    }
+    return width * sum;
+}
+
+/* Beyond f, with abs(P) <= C/f, higher powers than this are together below 1e-15 of the whole. */
+static double metroi_far_largest(const metroi_far *far, double f)
+{
+    double s = far->terms->steps, ratio = metroi_kelemen_bound(&far->terms->spectrum.kernel) / f;
+    if (far->binomial || ratio >= 1) return s;
+    return fmin(s, ceil((log(1e-15 * far->whole) - log(f * far->terms->spectrum.period)) / log(ratio)));
+}
+
+/* Where the integral of a pair may end: where all powers that still matter leave abs(d) f with 32 turns or more. */
+static double metroi_far_end(const metroi_far *far, double d)
+{
+    const metro_kernel *k = &far->terms->spectrum.kernel;
+    double f = far->edge, last = 1e6 * (f + 1 / metroi_far_residue(k));
+    for (; f < last; f *= 1.25)
+        if ((fabs(d) - metroi_far_spread(k, metroi_far_largest(far, 0.5 * f))) * f >= 32) return f;
+    return METROI_INFINITY;
+}
+
+/* The largest abs(d) whose integral goes on at f; -1: none does. */
+static double metroi_far_fastest(const metroi_far *far, double f)
+{
+    double fastest = -1;
+    size_t i;
+    for (i = 0; i < far->count; i++)
+        if (f <= 1.5 * far->end[i]) fastest = fmax(fastest, fabs(far->d[i]));
+    return fastest;
+}
+
+static double metroi_far_integrate(metroi_far *far)
+{
+    const metroi_far_terms *terms = far->terms;
+    double period = terms->spectrum.period, f = far->edge / 12, sum = 0, whole = far->whole;
+    double step, fastest, rest, node, weight, tolerance = terms->steps < 4 ? 1e-10 : 1e-13;
+    double residue = metroi_far_residue(&terms->spectrum.kernel);
+    int i;
+    for (;;) {
+        fastest = metroi_far_fastest(far, f);
+        if (fastest < 0) break;
+        rest = terms->rest(terms, f * period) - log(tolerance * far->whole);
+        if (f > 2 * far->edge && rest <= 0) break;
+        far->power = metroi_far_largest(far, f);
+        step = fmin(f / 2, 6 / (fmin(far->power, 34) * residue));
+        if (step * fastest > 3) step = 3 / fastest;
+        for (i = 0; i < 24; i++) {
+            node = metroi_gauss24(i, &weight);
+            sum += metroi_far_point(far, f + step * node, weight * step * period);
+        }
+        f += step;
+    }
+    far->whole = whole;
+    far->count = 0;
+    return sum;
+}
+
+/* d of eq 5.36, with whole turns taken off exactly where the circle is whole. */
+static double metroi_far_distance(const metro_kernel *k, double period, double j, double x)
+{
+    double c = metroi_far_near(k) ? k->size_min : k->size, p = j * c, e = fma(j, c, -p);
+    if (period < 1) return p - x + e;
+    p = p - rint(p) - x + e;
+    return p - rint(p);
+}
+
+/* Takes the pair (j, m) in, if it keeps in step with the modes. Returns what had to be integrated to make room. */
+static double metroi_far_take(metroi_far *far, double j, double x, double weight)
+{
+    const metroi_spectrum *spectrum = &far->terms->spectrum;
+    double d = metroi_far_distance(&spectrum->kernel, spectrum->period, j, x);
+    double lag = fabs(d) - metroi_far_spread(&spectrum->kernel, metroi_far_largest(far, 0.5 * far->edge));
+    if (lag * far->edge > 16) return 0;
+    far->j[far->count] = j;
+    far->d[far->count] = d;
+    far->end[far->count] = d == 0 ? METROI_INFINITY : metroi_far_end(far, d);
+    far->weight[far->count++] = weight;
+    return far->count == METROI_FAR_BATCH ? metroi_far_integrate(far) : 0;
+}
+
+/* The right side of eq 5.36; if x = 0, j and -j give the same. */
+static double metroi_far_sum(metroi_far *far, double x)
+{
+    double s = far->terms->steps, band = metroi_far_band(&far->terms->spectrum.kernel, s), sum = 0, j = 0, share = 1;
+    if (far->binomial) {
+        share = metroi_central_binomial(s);
+        j = fmod(s, 2);
+    }
+    while (j <= band) {
+        sum += metroi_far_take(far, j, x, x == 0 && j > 0 ? 2 * share : share);
+        if (j > 0 && x != 0) sum += metroi_far_take(far, -j, x, share);
+        if (far->binomial) share *= (s - j) / (s + j + 2);
+        j += far->binomial ? 2 : 1;
+    }
+    return sum + metroi_far_integrate(far);
+}
+
+/* The weights are those of eq 5.15; of seeds, abs(A_k)^2 is the sum of alpha_i alpha_l cos(2 pi k (x_i - x_l)). */
+static double metroi_far_seeds(metroi_far *far, const metroi_seeds *seeds)
+{
+    double sum = 0, same = 0, alpha;
+    size_t i, l;
+    for (i = 0; i < seeds->count; i++) {
+        alpha = metroi_seed_weight(seeds, i);
+        same += alpha * alpha;
+        for (l = 0; l < i; l++)
+            sum += 2 * alpha * metroi_seed_weight(seeds, l)
+                 * metroi_far_sum(far, metroi_circle_distance(seeds->point[i], seeds->point[l]));
+    }
+    return sum + same * metroi_far_sum(far, 0);
+}
+
+/* The left side of eq 5.36 with chi for 1 - chi: the modes that are added. */
+static double metroi_far_added(metroi_far *far, double last, double x, const metroi_seeds *seeds)
+{
+    const metroi_far_terms *terms = far->terms;
+    const metroi_spectrum *spectrum = &terms->spectrum;
+    metro_sum sum = { 0, 0 };
+    double weight, at, term, k;
+    int sign;
+    for (k = 1; k <= 2 * last; k++) {
+        weight = seeds != NULL ? metroi_seed_power(seeds, k) : metroi_cos_pi(2 * k, x / spectrum->period);
+        at = metroi_spectrum_log(spectrum, k, &sign);
+        term = 0.5 * erfc(6 * (k / last - 1)) * terms->term(terms, at, sign);
+        metro_sum_add(&sum, weight * term);
+        far->whole += fabs(term);
+    }
+    return metro_sum_value(&sum);
+}
+
+/* The whole sum over k >= 1, for a point x or for seeds. */
+static double metroi_far_series(const metroi_far_terms *terms, double x, const metroi_seeds *seeds)
+{
+    const metroi_spectrum *spectrum = &terms->spectrum;
+    const metro_kernel *k = &spectrum->kernel;
+    double last = metroi_far_near(k) ? 60 * sqrt(sqrt(terms->steps)) : 16 * spectrum->period / k->size, sum;
+    metroi_far far;
+    size_t i;
+    last = fmax(last, METROI_FAR_MODES);
+    far.terms = terms;
+    far.binomial = metroi_far_near(k) && terms->mean == NULL;
+    far.edge = last / spectrum->period;
+    far.whole = 0;
+    far.count = 0;
+    for (i = 0; i < METROI_FAR_SAMPLES; i++) far.cosine[i] = cos(2 * METROI_PI * ((double)i / METROI_FAR_SAMPLES));
+    sum = metroi_far_added(&far, last, x, seeds);
+    return sum + (seeds != NULL ? metroi_far_seeds(&far, seeds) : metroi_far_sum(&far, x));
+}
+
+/* # 5.11 Large steps
 
    A kernel that is replaced, with probability p, by an independent uniform draw keeps its modes, times 1 - p (eq
    3.1). So
 
-       e_s(x) = (1 - p)^s e_s(K; x), E_n = (1 - p)^n E_n(K)                           (5.27)
+       e_s(x) = (1 - p)^s e_s(K; x), E_n = (1 - p)^n E_n(K)                           (5.37)
 
    where K is the kernel alone: large steps forget at a rate that does not depend on the size. With that, the excess
    of every kernel: s >= 2 steps, `odd` says whether s is odd, 0 <= x <= 1/2. */
@@ -3541,13 +4072,13 @@ static metroi_scaled metroi_excess(const metro_kernel *k, double s, int odd, dou
     metroi_scaled e = metroi_scaled_make(0, 0);
     switch (k->shape) {
     case METRO_UNIFORM: e = metroi_uniform_excess(k->size, s, odd, x); break;
-    case METRO_TRIANGLE: e = metroi_uniform_excess(0.5 * k->size, 2 * s, 0, x); break; /* eq 5.22 */
+    case METRO_TRIANGLE: e = metroi_uniform_excess(0.5 * k->size, 2 * s, 0, x); break; /* eq 5.24 */
     case METRO_GAUSSIAN: e = metroi_gaussian_excess(k->size, s, x); break;
     case METRO_CAUCHY: e = metroi_cauchy_excess(k->size, s, x); break;
     case METRO_VON_MISES: e = metroi_excess_series(k, s, odd, x); break;
     case METRO_KELEMEN: e = metroi_kelemen_excess(k, s, odd, x); break;
     }
-    if (k->large > 0) e.log += s * log1p(-k->large); /* eq 5.27 */
+    if (k->large > 0) e.log += s * log1p(-k->large); /* eq 5.37 */
     return e;
 }
 
@@ -3586,28 +4117,28 @@ METRO_API double metro_startup_log_error(const metro_kernel *k, uint64_t n)
     return metroi_scaled_root_log(metroi_startup_square(k, n));
 }
 
-/* # 5.11 Many seeds
+/* # 5.12 Many seeds
 
    One way to reduce the start-up error is to start at one of several seeds x_i, chosen with the probability alpha_i,
    paper (13):
 
-       p_0(x) = sum_{i=1}^{N} alpha_i delta(x - x_i), sum_{i=1}^{N} alpha_i = 1       (5.28)
+       p_0(x) = sum_{i=1}^{N} alpha_i delta(x - x_i), sum_{i=1}^{N} alpha_i = 1       (5.38)
 
    The coefficients of p_0 are
 
-       A_k = sum_{i=1}^{N} alpha_i e^{-2 pi i k x_i}                                  (5.29)
+       A_k = sum_{i=1}^{N} alpha_i e^{-2 pi i k x_i}                                  (5.39)
 
    and after n steps, paper (14) on the unit period,
 
-       p_n(x) = sum_{k=-inf}^{inf} P*(k)^n A_k e^{2 pi i k x} = sum_{i=1}^{N} alpha_i (1 + e_n(x - x_i))      (5.30)
+       p_n(x) = sum_{k=-inf}^{inf} P*(k)^n A_k e^{2 pi i k x} = sum_{i=1}^{N} alpha_i (1 + e_n(x - x_i))      (5.40)
 
    Parseval's theorem gives the error:
 
-       E_n^2 = 2 sum_{k=1}^{inf} abs(P*(k))^{2n} abs(A_k)^2                           (5.31)
+       E_n^2 = 2 sum_{k=1}^{inf} abs(P*(k))^{2n} abs(A_k)^2                           (5.41)
 
    Paper (15) prints the seed sum inside the power, abs(P*(k) A_k)^{2n}. But the seeds act once, at the start, and the
    kernel n times. With the weights .2, .3, .5 at 0, .25 and .6, Delta = .3 and n = 3 the true error is .202907, and
-   so says eq 5.31; the printed form says .022252. (The x that it leaves inside is harmless, since the modulus removes
+   so says eq 5.41; the printed form says .022252. (The x that it leaves inside is harmless, since the modulus removes
    it.)
 
    N seeds at equal distances with equal weights leave only the multiples of N: all other A_k vanish. No other set of
@@ -3641,7 +4172,7 @@ static double metroi_seed_power(const metroi_seeds *seeds, double k)
     }
     re = metro_sum_value(&real);
     im = metro_sum_value(&imaginary);
-    return re * re + im * im; /* eq 5.29 */
+    return re * re + im * im; /* eq 5.39 */
 }
 
 /* Seeds as a user gives them: some, all finite, with weights that are not negative and sum to 1. */
@@ -3662,8 +4193,8 @@ static double metroi_circle_distance(double x, double y)
 }
 
 /* For an even number of steps every case comes down to simpler ones, times a constant: triangular steps to uniform
-   ones (eq 5.22), a size to its distance from a whole number (eq 5.19, where the shift is by whole turns), large
-   steps to none (eq 5.27). Returns the logarithm of the constant; the size becomes 0 where nothing is left. */
+   ones (eq 5.24), a size to its distance from a whole number (eq 5.21, where the shift is by whole turns), large
+   steps to none (eq 5.37). Returns the logarithm of the constant; the size becomes 0 where nothing is left. */
 
 static double metroi_seeds_reduce(metro_kernel *kernel, double *s)
 {
@@ -3684,7 +4215,7 @@ static double metroi_seeds_reduce(metro_kernel *kernel, double *s)
 
 /* At few steps the modes decay slowly, and the error is better had by eq 5.8, two seeds at a time,
 
-       E_n^2 = sum_{i,j} alpha_i alpha_j e_{2n}(x_i - x_j)                            (5.32)
+       E_n^2 = sum_{i,j} alpha_i alpha_j e_{2n}(x_i - x_j)                            (5.42)
 
    This costs N^2 evaluations, and where seeds cancel modes it is a small difference of large terms. So it serves
    where e_s is elementary, s <= 4, for uniform and Kelemen's steps, and for seeds so far apart that hardly any two
@@ -3697,7 +4228,6 @@ static int metroi_seeds_apart(const metro_kernel *k, double s, size_t count)
     double reach = k->shape == METRO_CAUCHY ? 5 * k->size * s : metroi_reach(k, s);
     if (k->shape == METRO_UNIFORM || k->shape == METRO_KELEMEN) {
         if (s <= 4) return 1;
-        if (k->shape == METRO_KELEMEN) return 0;
     }
     return reach < 0.01 && 4 * reach * (double)count <= 1;
 }
@@ -3714,7 +4244,7 @@ static metroi_scaled metroi_seeds_pairs(const metro_kernel *k, double s, const m
         for (j = 0; j < i; j++) {
             double alpha = metroi_seed_weight(seeds, i) * metroi_seed_weight(seeds, j);
             e = metroi_excess(k, s, 0, metroi_circle_distance(seeds->point[i], seeds->point[j]));
-            metroi_scaled_add(&sum, 2 * alpha * e.factor, e.log); /* eq 5.32 */
+            metroi_scaled_add(&sum, 2 * alpha * e.factor, e.log); /* eq 5.42 */
         }
     return sum;
 }
@@ -3747,7 +4277,8 @@ static metroi_scaled metroi_seeds_square(const metro_kernel *k, uint64_t n, cons
     } else if (!metroi_seeds_few(&kernel, s, seeds, &square)) {
         metroi_spectrum_make(&kernel, 1, &spectrum);
         square = metroi_series(&spectrum, s, 0, 0, seeds);
-        square.factor *= 2; /* eq 5.31 */
+        if (isnan(square.factor)) square = metroi_scaled_make(metroi_far_power(&kernel, 1, s, 0, seeds), 0);
+        square.factor *= 2; /* eq 5.41 */
     }
     square.log += factor;
     return square;
@@ -3776,18 +4307,18 @@ METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n
     return metroi_scaled_root_log(metroi_seeds_square(k, n, &set));
 }
 
-/* # 5.12 The interval
+/* # 5.13 The interval
 
    Between reflecting ends the natural functions are cosines, 1 and sqrt(2) cos(pi k x), and they are multiplied at
    each step by mu_k, the transform of the kernel at the frequency k/2. So
 
-       E_n^2(x_0) = 2 sum_{k=1}^{inf} mu_k^{2n} cos^2(pi k x_0)                       (5.33)
+       E_n^2(x_0) = 2 sum_{k=1}^{inf} mu_k^{2n} cos^2(pi k x_0)                       (5.43)
 
-   By eq 5.33 the ends are the worst seeds. Unfolded, the interval is a circle of length 2 with the seeds x_0 and
+   By eq 5.43 the ends are the worst seeds. Unfolded, the interval is a circle of length 2 with the seeds x_0 and
    -x_0; scaled back to length 1, and turned, these are two seeds of weight 1/2 at the distance x_0 under the kernel
    at half its size:
 
-       E_n(x_0) = E_n("circle, half the size, seeds" 0 "and" x_0 "of weight" 1/2)     (5.34)
+       E_n(x_0) = E_n("circle, half the size, seeds" 0 "and" x_0 "of weight" 1/2)     (5.44)
 
    because abs(A_k)^2 = cos^2(pi k x_0). From the middle, x_0 = 1/2, the odd modes vanish and the even ones are those
    of the circle of length 1 with the kernel as it is. */
@@ -3802,7 +4333,7 @@ static metroi_scaled metroi_reflect_square(const metro_kernel *k, double x0, uin
     half.size *= 0.5;
     half.size_min *= 0.5;
     point[1] = x0;
-    return metroi_seeds_square(&half, n, &seeds); /* eq 5.34 */
+    return metroi_seeds_square(&half, n, &seeds); /* eq 5.44 */
 }
 
 METRO_API double metro_reflect_startup_error(const metro_kernel *k, double x0, uint64_t n)
@@ -3815,18 +4346,18 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
     return metroi_scaled_root_log(metroi_reflect_square(k, x0, n));
 }
 
-/* # 5.13 More dimensions
+/* # 5.14 More dimensions
 
    The paper says of Figure 2 that the situation gets worse for higher dimensions. It does, and we can say by how
    much. If a step perturbs all d coordinates at once and independently, the density of the state is the product of
    those of its coordinates, and with e_j the start-up error of coordinate j
 
-       1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.35)
+       1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.45)
 
    While the e_j are large, the error grows like their product; when they are small, only like sqrt(d). We evaluate eq
-   5.35 in logarithms:
+   5.45 in logarithms:
 
-       E_n^2 = exp(sum_{j=1}^{d} ln(1 + e_j^2)) - 1                                   (5.36)
+       E_n^2 = exp(sum_{j=1}^{d} ln(1 + e_j^2)) - 1                                   (5.46)
 
    A step that perturbs only one coordinate, picked at random, is another matter. Its eigenvalues are 1 - (1/d) sum_j
    (1 - P*(k_j)), and with probability (1 - 1/d)^n a given coordinate has not been touched after n steps: p_n keeps a
@@ -3849,7 +4380,7 @@ static metroi_scaled metroi_axes_square(const metro_kernel *k, size_t axes, uint
         sum += log1p(metroi_scaled_value(e));
     }
     if (sum < 1e-17) return small;
-    if (sum < 1) return metroi_scaled_make(expm1(sum), 0); /* eq 5.36 */
+    if (sum < 1) return metroi_scaled_make(expm1(sum), 0); /* eq 5.46 */
     return sum < METROI_INFINITY ? metroi_scaled_make(-expm1(-sum), sum) : metroi_scaled_make(sum, 0);
 }
 
@@ -3863,32 +4394,32 @@ METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes
     return metroi_scaled_root_log(metroi_axes_square(k, axes, n));
 }
 
-/* # 5.14 The running mean
+/* # 5.15 The running mean
 
    A picture averages all samples so far. A sample picked at random among the M that follow a burn-in of b has the
    density (p_b + .. + p_{b+M-1})/M, and by eq 5.5 its coefficients are geometric sums:
 
-       S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.37)
-       E^2 = 2 sum_{k=1}^{inf} S_k^2                                                  (5.38)
+       S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.47)
+       E^2 = 2 sum_{k=1}^{inf} S_k^2                                                  (5.48)
 
-   For a mode with P near 1 this dies like tau/M, by averaging, while P^n dies exponentially; section 5.18 says what
+   For a mode with P near 1 this dies like tau/M, by averaging, while P^n dies exponentially; section 5.19 says what
    that means for an estimate. For M = 1 it is E_b again. With b = 0 the mean holds p_0, and its error is infinite.
 
-   At b = 1 the series is slow, like 1/k^2 for uniform steps. Squaring eq 5.37 out gives powers of P again,
+   At b = 1 the series is slow, like 1/k^2 for uniform steps. Squaring eq 5.47 out gives powers of P again,
 
-       M^2 S_k^2 = sum_{s=2b}^{2(b+M-1)} c_s P*(k)^s, c_s = min(s - 2b + 1, 2(b+M-1) - s + 1)      (5.39)
+       M^2 S_k^2 = sum_{s=2b}^{2(b+M-1)} c_s P*(k)^s, c_s = min(s - 2b + 1, 2(b+M-1) - s + 1)      (5.49)
 
    and each power, summed over k, is a value e_s(0) that we know how to find. So the first powers, which make the
    series slow, are taken out of it:
 
        M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + 2 sum_{k=1}^{inf} G_k
-       G_k = M^2 S_k^2 - sum_{s=2b}^{J} c_s P*(k)^s                                   (5.40)
+       G_k = M^2 S_k^2 - sum_{s=2b}^{J} c_s P*(k)^s                                   (5.50)
 
    Uniform steps: J = 16, triangular ones: J = 8, Kelemen's: J = 4. Where J would be under 2b nothing is taken out. On
    a shorter circle, which must hold the reach of 2(b+M-1) steps, the mode k = 0 does not drop out and all is divided
-   by T, as in eq 5.14:
+   by T, as in eq 5.16:
 
-       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + frac{1}{T} (G_0 + 2 sum_{k=1}^{inf} G_k) - G_0      (5.41)
+       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + frac{1}{T} (G_0 + 2 sum_{k=1}^{inf} G_k) - G_0      (5.51)
 
    With large steps everything carries (1 - p)^s; we keep (1 - p)^{2b} in front and the rest inside. */
 
@@ -3916,7 +4447,7 @@ static metroi_scaled metroi_mean_powers(const metroi_mean *mean, double last, do
         c = metroi_mean_weight(mean, i);
         if ((i + 1) * pow(ratio, i) < 1e-17) break;
         e = metroi_excess(mean->kernel, 2 * mean->burn + i, fmod(i, 2) > 0, 0);
-        metroi_scaled_add(&sum, c * e.factor, e.log); /* eq 5.39 */
+        metroi_scaled_add(&sum, c * e.factor, e.log); /* eq 5.49 */
     }
     return sum;
 }
@@ -3945,16 +4476,16 @@ static double metroi_mean_geometric(const metroi_mean *mean, double at, int sign
 /* The tails. Gaussian and von Mises modes: 1 - P grows at most like k^2, so P^b/(1 - P) falls faster than 1/k^2 and
    the terms faster than 1/k^4; for Cauchy modes it is 1/k and 1/k^2:
 
-       sum_{j>k} G_j <= frac{k}{3} (frac{P_k^b}{(1-p)(1 - P_k)})^2, "Cauchy" k "for" k/3      (5.42)
+       sum_{j>k} G_j <= frac{k}{3} (frac{P_k^b}{(1-p)(1 - P_k)})^2, "Cauchy" k "for" k/3      (5.52)
 
    Uniform and triangular modes obey the first up to the first zero of P, and from there on, as Kelemen's do from the
    start, with a bound abs(P) <= x on all modes from k on, x falling like 1/k, 1/k^2 and 1/k,
 
-       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.43)
+       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.53)
 
    with 2 J + 1 for the J under k where x falls like 1/k^2. */
 
-/* eq 5.42 with `share` for k/3, and eq 5.43 with x = `bound` falling like 1/k^fall; logarithms. */
+/* eq 5.52 with `share` for k/3, and eq 5.53 with x = `bound` falling like 1/k^fall; logarithms. */
 
 static double metroi_mean_near(const metroi_mean *mean, double share, double at)
 {
@@ -3999,45 +4530,87 @@ static double metroi_mean_tail(const metroi_mean *mean, const metroi_spectrum *s
     return log(2) + fmax(near, metroi_mean_far(mean, k, fall > 1 ? x * x : x, fall));
 }
 
-/* The series of eq 5.41 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
+/* G_k without (1 - p)^{2b} over P^{2b}, and for Kelemen's kernel the sum of section 5.10 over it. */
+
+static double metroi_mean_term(const metroi_mean *mean, double at, int sign)
+{
+    double v, r = metroi_mean_geometric(mean, at, sign, &v);
+    return r * r - metroi_mean_polynomial(mean, v); /* eq 5.50 */
+}
+
+static double metroi_mean_far_term(const metroi_far_terms *terms, double at, int sign)
+{
+    const metroi_mean *mean = (const metroi_mean *)terms->mean;
+    return metroi_mean_term(mean, at, sign) * exp(2 * mean->burn * at);
+}
+
+static double metroi_mean_far_rest(const metroi_far_terms *terms, double k)
+{
+    return metroi_mean_kelemen_tail((const metroi_mean *)terms->mean, terms->spectrum.period, k);
+}
+
+static double metroi_mean_far_modes(const metroi_mean *mean, double period, double steps)
+{
+    metroi_far_terms terms;
+    if (mean->kernel->shape != METRO_KELEMEN || !metroi_far_applies(mean->kernel, steps, period)) return METROI_NAN;
+    metroi_spectrum_make(mean->kernel, period, &terms.spectrum);
+    terms.steps = steps;
+    terms.mean = mean;
+    terms.term = metroi_mean_far_term;
+    terms.rest = metroi_mean_far_rest;
+    return metroi_far_series(&terms, 0, NULL);
+}
+
+/* The series of eq 5.51 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
    reach counts only the steps whose weight (1 - p)^{s-2b} is above e^{-45}. */
+
+static metroi_scaled metroi_mean_series(const metroi_mean *mean, const metroi_spectrum *spectrum, double longest,
+                                        double taken)
+{
+    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY);
+    double at, k, total, rest;
+    int sign;
+    for (k = 1;; k++) {
+        at = metroi_spectrum_log(spectrum, k, &sign);
+        metroi_scaled_add(&sum, metroi_mean_term(mean, at, sign), 2 * mean->burn * at);
+        if (k > 16 && fmod(k, 8) > 0) continue;
+        total = fmax(metroi_scaled_log(sum), taken);
+        rest = metroi_mean_tail(mean, spectrum, METROI_RESIGNATION, at);
+        if (metroi_series_fails(spectrum, longest, k, rest, total)) return metroi_scaled_make(METROI_NAN, 0);
+        rest = metroi_mean_tail(mean, spectrum, k, at);
+        if (rest <= metroi_series_tolerance(spectrum, k) - log(10) + total) return sum;
+    }
+}
 
 static metroi_scaled metroi_mean_modes(const metroi_mean *mean, double taken)
 {
     metroi_spectrum spectrum;
-    metroi_scaled sum = metroi_scaled_make(0, -METROI_INFINITY);
-    double longest = 2 * (mean->steps - 1), reach, zero = 0, at, r, v, k;
-    double total, rest, tolerance;
-    int sign;
+    metroi_scaled sum;
+    double longest = 2 * (mean->steps - 1), reach, zero = 0, r, v;
     if (mean->log_keep * longest < -45) longest = -45 / mean->log_keep;
-    reach = metroi_reach(mean->kernel, 2 * mean->burn + longest);
-    metroi_spectrum_make(mean->kernel, reach < 1 ? reach : 1, &spectrum);
+    longest += 2 * mean->burn;
+    reach = metroi_reach(mean->kernel, longest);
     if (reach < 1) {
         r = metroi_mean_geometric(mean, 0, 1, &v);
         zero = r * r - metroi_mean_polynomial(mean, mean->keep);
-        taken += log(reach);
-        if (log(zero) > taken) taken = log(zero);
+        taken = fmax(taken + log(reach), log(zero));
     }
-    for (k = 1;; k++) {
-        at = metroi_spectrum_log(&spectrum, k, &sign);
-        r = metroi_mean_geometric(mean, at, sign, &v);
-        metroi_scaled_add(&sum, r * r - metroi_mean_polynomial(mean, v), 2 * mean->burn * at); /* eq 5.40 */
-        if (k > 16 && fmod(k, 8) > 0) continue;
-        tolerance = metroi_series_tolerance(&spectrum, k) - log(10);
-        if (isnan(tolerance)) return metroi_scaled_make(tolerance, 0);
-        total = metroi_scaled_log(sum);
-        rest = metroi_mean_tail(mean, &spectrum, k, at);
-        if (rest <= tolerance + (total > taken ? total : taken)) break;
+    metroi_spectrum_make(mean->kernel, reach < 1 ? reach : 1, &spectrum);
+    if (!metroi_far_fits(mean->kernel, longest)) longest = METROI_INFINITY; /* which section 5.10 refuses */
+    sum = metroi_mean_series(mean, &spectrum, longest, taken);
+    if (isnan(sum.factor)) {
+        reach *= 1.25;
+        sum = metroi_scaled_make(metroi_mean_far_modes(mean, reach < 1 ? reach : 1, longest), 0);
     }
     sum.factor *= 2;
-    if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.41 */
+    if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.51 */
     return sum;
 }
 
 /* Cauchy modes fall slowly when gamma b is small, and their powers sum slowly when M is large; but as a function of
    s, c_s e_s(0) is smooth. We add 1024 powers one by one, and the rest by Euler and Maclaurin's formula at midpoints,
 
-       sum_{i=u}^{v-1} g(i) = int_{u-1/2}^{v-1/2} g(t) dt - frac{1}{24} (g'(v - 1/2) - g'(u - 1/2)) + ...      (5.44)
+       sum_{i=u}^{v-1} g(i) = int_{u-1/2}^{v-1/2} g(t) dt - frac{1}{24} (g'(v - 1/2) - g'(u - 1/2)) + ...      (5.54)
 
    over panels that double in length, 24 Gauss points in each, the derivative taken as g(v) - g(v-1). What is left out
    is of the order of g'''/2000, and g changes over 1000 steps or more. c_s rises for i < M and falls from there; each
@@ -4064,7 +4637,7 @@ static double metroi_cauchy_slope(const metroi_mean *mean, double from, double t
         }
         slope = metroi_cauchy_power(mean, end, falling) - metroi_cauchy_power(mean, end - 1, falling)
               - metroi_cauchy_power(mean, i, falling) + metroi_cauchy_power(mean, i - 1, falling);
-        sum += panel * (end - i) - slope / 24; /* eq 5.44 */
+        sum += panel * (end - i) - slope / 24; /* eq 5.54 */
         i = end;
     }
     return sum;
@@ -4103,7 +4676,7 @@ static metroi_scaled metroi_mean_sum(metroi_mean *mean)
     if (mean->last >= 2 * (mean->steps - 1)) return sum;
     sum.log -= 2 * mean->burn * mean->log_keep;
     modes = metroi_mean_modes(mean, metroi_scaled_log(sum));
-    metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.40 */
+    metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.50 */
     sum.log += 2 * mean->burn * mean->log_keep;
     return sum;
 }
@@ -4124,7 +4697,7 @@ static metroi_scaled metroi_mean_square(const metro_kernel *k, uint64_t burn, ui
     mean.odd_steps = (int)(steps & 1);
     mean.last = -1;
     square = metroi_mean_sum(&mean);
-    square.factor /= mean.steps * mean.steps; /* eq 5.38 */
+    square.factor /= mean.steps * mean.steps; /* eq 5.48 */
     return square;
 }
 
@@ -4138,9 +4711,9 @@ METRO_API double metro_startup_log_error_mean(const metro_kernel *k, uint64_t bu
     return metroi_scaled_root_log(metroi_mean_square(k, burn, steps));
 }
 
-/* # 5.15 The density itself
+/* # 5.16 The density itself
 
-   p_n(x) is eq 5.30 term by term. At n = 1 it is the kernel's own density, with its jumps; from n = 2 on it is
+   p_n(x) is eq 5.40 term by term. At n = 1 it is the kernel's own density, with its jumps; from n = 2 on it is
    continuous. Rounding can leave a value of -1e-16 where the density is 0; it is returned as 0. */
 
 static double metroi_startup_density_one(const metro_kernel *k, uint64_t n, double x, double seed)
@@ -4162,29 +4735,29 @@ METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double
     if (!metroi_kernel_valid(k) || !isfinite(x) || !metroi_seeds_valid(&set)) return METROI_NAN;
     for (i = 0; i < seeds; i++) {
         double weight = metroi_seed_weight(&set, i);
-        if (weight > 0) sum += weight * metroi_startup_density_one(k, n, x, seed[i]); /* eq 5.30 */
+        if (weight > 0) sum += weight * metroi_startup_density_one(k, n, x, seed[i]); /* eq 5.40 */
     }
     return sum < 0 ? 0 : sum;
 }
 
-/* # 5.16 Other distances
+/* # 5.17 Other distances
 
    The paper measures the error in L2. A probabilist would ask for the total variation, the largest error of the
    probability of any event; a statistician for the Kullback-Leibler divergence:
 
-       TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.45)
+       TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.55)
 
-   The L2 error bounds both distances of eq 5.45, by the inequalities of Cauchy and Schwarz and of Jensen:
+   The L2 error bounds both distances of eq 5.55, by the inequalities of Cauchy and Schwarz and of Jensen:
 
-       TV <= min(1, E_n/2)                                                            (5.46)
-       KL <= ln(1 + E_n^2)                                                            (5.47)
+       TV <= min(1, E_n/2)                                                            (5.56)
+       KL <= ln(1 + E_n^2)                                                            (5.57)
 
    For a uniform kernel at n = 1 the density has two values. With f = Delta - floor(Delta), it is 1 + q u, u = (1 -
    f)/Delta, on a part f of the circle, and 1 + q v, v = -f/Delta, on the rest, where q = 1 - p is what large steps
    leave. So
 
-       TV = q f (1 - f)/Delta                                                         (5.48)
-       KL = f phi(q u) + (1 - f) phi(q v), phi(t) = (1 + t) ln(1 + t) - t             (5.49)
+       TV = q f (1 - f)/Delta                                                         (5.58)
+       KL = f phi(q u) + (1 - f) phi(q v), phi(t) = (1 + t) ln(1 + t) - t             (5.59)
 
    and the t in phi, which cancel in the sum, keep its digits where the values of t are small; below 1/8 phi is summed
    as t^2/2 - t^3/6 + t^4/12 - ... */
@@ -4206,9 +4779,9 @@ static int metroi_startup_two_valued(const metro_kernel *k, uint64_t n)
 METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n)
 {
     double f = k->size - floor(k->size), e;
-    if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.48 */
+    if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.58 */
     e = metro_startup_error(k, n);
-    return e > 2 ? 1 : 0.5 * e; /* eq 5.46 */
+    return e > 2 ? 1 : 0.5 * e; /* eq 5.56 */
 }
 
 METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n)
@@ -4216,25 +4789,29 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
     double f = k->size - floor(k->size), q = 1 - k->large, e;
     if (metroi_startup_two_valued(k, n)) {
         double above = q * ((1 - f) / k->size), below = -q * (f / k->size);
-        return f * metroi_divergence_phi(above) + (1 - f) * metroi_divergence_phi(below); /* eq 5.49 */
+        return f * metroi_divergence_phi(above) + (1 - f) * metroi_divergence_phi(below); /* eq 5.59 */
     }
     e = metro_startup_error(k, n);
-    return log1p(e * e); /* eq 5.47 */
+    return log1p(e * e); /* eq 5.57 */
 }
 
 #undef METROI_DEBYE
 #undef METROI_MODES
+#undef METROI_FAR_BATCH
+#undef METROI_FAR_MODES
+#undef METROI_FAR_SAMPLES
 #undef METROI_PATIENCE
+#undef METROI_RESIGNATION
 #undef METROI_SPLINE_ORDER
 #undef METROI_WIDEST
 
-/* # 5.17 The sphere
+/* # 5.18 The sphere
 
    A state may be a direction, and the paper perturbs directions inside a cone. Spherical harmonics play the part of
    the Fourier series: a kernel that depends on the angle alone multiplies all 2l + 1 harmonics of degree l by
    lambda_l (chapter 3). Against the uniform probability on the sphere, with p_n the density relative to it,
 
-       E_n^2 = sum_{l=1}^{inf} (2l + 1) lambda_l^{2n} = p_{2n}(0) - 1                 (5.50)
+       E_n^2 = sum_{l=1}^{inf} (2l + 1) lambda_l^{2n} = p_{2n}(0) - 1                 (5.60)
 
    where p_{2n}(0) is the density of being back at the seed. The factor 2l + 1 is the price of a second dimension: for
    a small cone some 1/alpha^2 modes wait to be forgotten, not 1/Delta.
@@ -4242,15 +4819,15 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
    One and two steps have closed forms. Let f = sin^2(alpha/2) be the share of the sphere that the cone takes; then
    p_2(0) = 1/f, and
 
-       E_1 = cot(alpha/2)                                                             (5.51)
+       E_1 = cot(alpha/2)                                                             (5.61)
 
    For E_2 we need p_2 everywhere: at an angle theta from the seed it is the share of the sphere in which two cones,
    theta apart, overlap, over f^2. The overlap is elementary, two sectors less two triangles. With sin(theta/2) =
    sin(alpha) sin(t),
 
        f p_2 = frac{2}{pi} (atan2(cos(t), cos(alpha) sin(t)) - frac{1}{2 f} asin(A)),
-       A = frac{2 f cos(t) sin(t)}{sqrt{1 - sin^2(alpha) sin^2(t)}}                   (5.52)
-       1 + E_2^2 = 2 sin^2(alpha) int_{0}^{pi/2} p_2^2 sin(t) cos(t) dt               (5.53)
+       A = frac{2 f cos(t) sin(t)}{sqrt{1 - sin^2(alpha) sin^2(t)}}                   (5.62)
+       1 + E_2^2 = 2 sin^2(alpha) int_{0}^{pi/2} p_2^2 sin(t) cos(t) dt               (5.63)
 
    and the variable t makes the integrand so smooth that 24 Gauss points give it to rounding. The value is f (1 +
    E_2^2). */
@@ -4264,20 +4841,20 @@ static double metroi_cone_twice(double f)
         s = sin(t);
         c = cos(t);
         p = 2 / METROI_PI * (atan2(c, cosine * s) - asin(2 * f * c * s / sqrt(1 - sine * s * (sine * s))) / (2 * f));
-        sum += weight * p * p * s * c; /* eq 5.52 */
+        sum += weight * p * p * s * c; /* eq 5.62 */
     }
-    return 4 * METROI_PI * (1 - f) * sum; /* eq 5.53: sin^2(alpha) = 4 f (1 - f) */
+    return 4 * METROI_PI * (1 - f) * sum; /* eq 5.63: sin^2(alpha) = 4 f (1 - f) */
 }
 
-/* From three steps on we sum eq 5.50 relative to its first term, with the recurrence of section 3.10. Its terms fall
+/* From three steps on we sum eq 5.60 relative to its first term, with the recurrence of section 3.10. Its terms fall
    in the end like those of a Bessel function,
 
-       abs(lambda_l) <= C_b (l + 1/2)^{-3/2}, C_b = 1.16 (1 + cos(alpha)) sqrt{2/pi} sin^{-3/2}(alpha)      (5.54)
+       abs(lambda_l) <= C_b (l + 1/2)^{-3/2}, C_b = 1.16 (1 + cos(alpha)) sqrt{2/pi} sin^{-3/2}(alpha)      (5.64)
 
    (the form is the asymptotic one, Szego 1939, 8.21; the factor 1.16 was found numerically over all degrees and
    angles, 1.151 being needed), so what follows degree l is at most 2 C_b^{2n} (l + 1/2)^{2-3n}/(3n - 2). For many
    steps that bound comes late. While lambda_l/lambda_1 is above 0.3 no later one is larger, because the second lobe
-   never exceeds 0.25; up to the degree where eq 5.54 falls to lambda_l the terms are thus at most those of degree
+   never exceeds 0.25; up to the degree where eq 5.64 falls to lambda_l the terms are thus at most those of degree
    l. */
 
 static double metroi_cone_term(double gap, double n)
@@ -4297,9 +4874,9 @@ static double metroi_cone_series(double f, double n)
     double bound = log(1.16 * 2 * sqrt(2 / METROI_PI)) - 0.75 * log(4 * f * (1 - f));
     for (l = 2;; l++) {
         metroi_cone_next(&cone);
-        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n); /* eq 5.50 */
+        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n); /* eq 5.60 */
         if (fmod(l, 16) > 0) continue;
-        tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.54 */
+        tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.64 */
         if (cone.gap < 0.7) {
             reach = log1p(-cone.gap);
             tail = 2 * n * reach + 4 / 3.0 * (bound - reach) + log(3);
@@ -4311,7 +4888,7 @@ static double metroi_cone_series(double f, double n)
 /* A narrow cone makes this series long. But while the chain has not come round the sphere, the return density times
    its area is a smooth function of the curvature that it has met: with tau = n f,
 
-       Phi(tau) = tau (1 + E_n^2)                                                     (5.55)
+       Phi(tau) = tau (1 + E_n^2)                                                     (5.65)
 
    is analytic at tau = 0, where the sphere is a plane (for many steps it is that of the heat kernel on the sphere, 1
    + tau/3 + tau^2/15 + ...). Below tau = h = 0.005 we therefore evaluate it at h, 2h, .. 6h, where the series has
@@ -4333,7 +4910,7 @@ static double metroi_sphere_extend(const double *phi, double x)
     return sum;
 }
 
-/* E^2 from Phi and ln tau, eq 5.55. */
+/* E^2 from Phi and ln tau, eq 5.65. */
 static metroi_scaled metroi_sphere_square(double phi, double log_tau)
 {
     if (log_tau < -40) return metroi_scaled_make(phi, -log_tau);
@@ -4345,7 +4922,7 @@ static metroi_scaled metroi_cone_square(double f, double log_f, double n)
 {
     double phi[6], tau;
     int i;
-    /* Towards the hemisphere the integrand of eq 5.53 bends too sharply for its 24 points, and the series is short */
+    /* Towards the hemisphere the integrand of eq 5.63 bends too sharply for its 24 points, and the series is short */
     if (n < 3 && f < 0.3) return metroi_sphere_square(metroi_cone_twice(f > 1e-30 ? f : 1e-30), log_f);
     if (n * f >= METROI_NEAR_PLANE) return metroi_scaled_make(1, metroi_cone_series(f, n) + 2 * n * log1p(-f));
     for (i = 1; i <= 6; i++) {
@@ -4355,9 +4932,9 @@ static metroi_scaled metroi_cone_square(double f, double log_f, double n)
     return metroi_sphere_square(metroi_sphere_extend(phi, n * f / METROI_NEAR_PLANE), log(n) + log_f);
 }
 
-/* A cone wider than a hemisphere has the spectrum of the complementary one times cot^2(alpha/2), eq 3.18, so
+/* A cone wider than a hemisphere has the spectrum of the complementary one times cot^2(alpha/2), eq 3.19, so
 
-       E_n(alpha) = cot^{2n}(alpha/2) E_n(pi - alpha) "for" alpha > pi/2              (5.56)
+       E_n(alpha) = cot^{2n}(alpha/2) E_n(pi - alpha) "for" alpha > pi/2              (5.66)
 
    and from alpha = pi on a single step is uniform: the error is exactly 0. */
 
@@ -4371,13 +4948,13 @@ static metroi_scaled metroi_cone_startup(double half_angle, uint64_t n)
     if (n == 1) return metroi_scaled_make(1, 2 * (log(c) - log(s)));
     if (half_angle <= 0.5 * METROI_PI) return metroi_cone_square(s * s, 2 * log(s), steps);
     square = metroi_cone_square(c * c, 2 * log(c), steps);
-    square.log += 4 * steps * (log(c) - log(s)); /* eq 5.56 */
+    square.log += 4 * steps * (log(c) - log(s)); /* eq 5.66 */
     return square;
 }
 
 METRO_API double metro_cone_startup_error(double half_angle, uint64_t n)
 {
-    /* eq 5.51, without the detour over logarithms */
+    /* eq 5.61, without the detour over logarithms */
     if (n == 1 && half_angle > 0 && half_angle < METROI_PI) return cos(0.5 * half_angle) / sin(0.5 * half_angle);
     return metroi_scaled_root(metroi_cone_startup(half_angle, n));
 }
@@ -4387,7 +4964,7 @@ METRO_API double metro_cone_startup_log_error(double half_angle, uint64_t n)
     return metroi_scaled_root_log(metroi_cone_startup(half_angle, n));
 }
 
-/* The von Mises-Fisher kernel goes the same way with tau = n/kappa in eq 5.55, since its lambda_l is about exp(-l
+/* The von Mises-Fisher kernel goes the same way with tau = n/kappa in eq 5.65, since its lambda_l is about exp(-l
    (l+1)/(2 kappa)). At tau = h the sum needs 10 + sqrt(80/h) degrees, 137, for any n; the terms are positive and
    their logarithms concave. One step has E_1^2 = kappa lambda_1. */
 
@@ -4433,13 +5010,13 @@ METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n)
 }
 
 /* A third kernel needs no function. The phase function of Henyey and Greenstein (1941), with mean cosine g, has
-   lambda_l = g^l, so eq 5.50 is a geometric series, and
+   lambda_l = g^l, so eq 5.60 is a geometric series, and
 
-       E_n^2 = frac{x (3 - x)}{(1 - x)^2}, x = g^{2n}                                 (5.57)
+       E_n^2 = frac{x (3 - x)}{(1 - x)^2}, x = g^{2n}                                 (5.67)
 
-   By eq 5.57 a chain of such steps with g = 0.9 is within 1 % of the uniform density after 50 steps. */
+   By eq 5.67 a chain of such steps with g = 0.9 is within 1 % of the uniform density after 50 steps. */
 
-/* # 5.18 The error of a run
+/* # 5.19 The error of a run
 
    The density p_n is about one sample. A picture is a mean over all of them, and what a person sees is the error of
    that mean: its bias, which the start-up leaves, and its variance, which the correlation of neighbours feeds. For an
@@ -4448,19 +5025,19 @@ METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n)
    Seen from a seed x, the integrand is a sum of even and odd waves of the distance u = z - x that the chain has gone,
 
        f(x + u) = sum_{i} (a_i cos(2 pi i u) + b_i sin(2 pi i u))
-       a_i = c_i cos(2 pi i x) + s_i sin(2 pi i x), b_i = s_i cos(2 pi i x) - c_i sin(2 pi i x)      (5.58)
+       a_i = c_i cos(2 pi i x) + s_i sin(2 pi i x), b_i = s_i cos(2 pi i x) - c_i sin(2 pi i x)      (5.68)
 
    After n steps cos(2 pi i u) has the mean P_i^n, P_i short for P*(i), and the sine has the mean 0. So the mean of
    the M samples from n = b on is off by
 
        beta(x) = frac{1}{M} sum_{i} a_i P_i^b S_M(P_i),
-       S_M(P) = 1 + P + ... + P^{M-1} = frac{1 - P^M}{1 - P}                          (5.59)
+       S_M(P) = 1 + P + ... + P^{M-1} = frac{1 - P^M}{1 - P}                          (5.69)
 
    The bias of the estimate is the mean of beta over the seeds. Its variance is the variance of beta over the seeds
    plus the mean over the seeds of the variance from a given seed (the law of total variance); even and odd waves do
    not correlate, because u and -u are equally likely:
 
-       M^2 Var = sum_{i,j} (X_{ij} G_{ij} + Y_{ij} H_{ij} + Z_{ij} w_i w_j), w_i = P_i^b S_M(P_i)      (5.60)
+       M^2 Var = sum_{i,j} (X_{ij} G_{ij} + Y_{ij} H_{ij} + Z_{ij} w_i w_j), w_i = P_i^b S_M(P_i)      (5.70)
 
    where X, Y are the means of a_i a_j and b_i b_j over the seeds, Z is the covariance of a_i and a_j over them, and
    G_{ij} (H_{ij}) is the covariance of sum cos(2 pi i u_n) with sum cos(2 pi j u_n) (of the sums of sines) over the
@@ -4471,7 +5048,7 @@ typedef struct {
     int seeded;
     double *memory;
     double *power, *mean;         /* (c_i^2 + s_i^2)/2, and the mean of a_i over the seeds */
-    double *even, *odd, *between; /* X, Y, Z of eq 5.60, for i <= j at metroi_pair_index */
+    double *even, *odd, *between; /* X, Y, Z of eq 5.70, for i <= j at metroi_pair_index */
 } metroi_integrand;
 
 static size_t metroi_pair_index(size_t i, size_t j)
@@ -4487,7 +5064,7 @@ static void metroi_integrand_add(metroi_integrand *f, const double *cosine, cons
     for (i = 1; i <= f->harmonics; i++) {
         double c = metroi_cos_pi(2 * (double)i, x), s = metroi_sin_pi(2 * (double)i, x);
         double p = cosine != NULL ? cosine[i - 1] : 0, q = sine != NULL ? sine[i - 1] : 0;
-        a[i - 1] = p * c + q * s; /* eq 5.58 */
+        a[i - 1] = p * c + q * s; /* eq 5.68 */
         b[i - 1] = q * c - p * s;
         if (!pairs) f->mean[i - 1] += alpha * a[i - 1];
     }
@@ -4564,16 +5141,16 @@ static double metroi_mode_sum(metroi_mode mode, uint64_t m)
     double at = (double)m * mode.log;
     if (mode.gap == 0) return (double)m;
     if (mode.value > 0 && at > -0.7) return -expm1(at) / mode.gap;
-    return (1 - metroi_mode_power(mode, m)) / mode.gap; /* eq 5.59 */
+    return (1 - metroi_mode_power(mode, m)) / mode.gap; /* eq 5.69 */
 }
 
-/* # 5.19 Covariances by doubling
+/* # 5.20 Covariances by doubling
 
    Written out, G and H are double sums of differences of powers, whose closed form divides by (1 - P)^2: at small
    sizes and few steps it loses all digits of a variance that is itself small. We put a run together from shorter ones
    instead. Let a run of m steps be followed by one of m'. With
 
-       eta_m = frac{1}{2} (P_{i-j}^m + P_{i+j}^m), zeta_m = frac{1}{2} (P_{i-j}^m - P_{i+j}^m)      (5.61)
+       eta_m = frac{1}{2} (P_{i-j}^m + P_{i+j}^m), zeta_m = frac{1}{2} (P_{i-j}^m - P_{i+j}^m)      (5.71)
 
    which are the means of cos(2 pi i u_m) cos(2 pi j u_m) and of the product of the sines, a run of m' that starts at
    u_m instead of 0 has the even covariance eta_m G' + zeta_m H', by the addition theorem. Let e_m be the covariance
@@ -4583,7 +5160,7 @@ static double metroi_mode_sum(metroi_mode mode, uint64_t m)
        e_{m+m'} = eta_m e_{m'} + zeta_m o_{m'} + e_m P_i^{m'} P_j^{m'}
        g^{ij}_{m+m'} = eta_m g^{ij}_{m'} + zeta_m h^{ij}_{m'} + P_j^{m'} (g^{ij}_m + e_m S_{m'}(P_i))
        G_{m+m'} = G_m + eta_m G_{m'} + zeta_m H_{m'} + e_m S_{m'}(P_i) S_{m'}(P_j)
-                  + g^{ij}_m S_{m'}(P_j) + g^{ji}_m S_{m'}(P_i)                       (5.62)
+                  + g^{ij}_m S_{m'}(P_j) + g^{ji}_m S_{m'}(P_i)                       (5.72)
 
    and the same with even and odd exchanged for o (where the mean of a sine is 0, so o_m = zeta_m), h and H. For
    positive falling modes every term is positive: nothing cancels, and M steps need 2 log2(M) such steps. A run of one
@@ -4615,7 +5192,7 @@ static void metroi_run_measure(const metroi_pair *pair, metroi_run_block *run)
     run->power[1] = metroi_mode_power(pair->j, run->steps);
     run->total[0] = metroi_mode_sum(pair->i, run->steps);
     run->total[1] = metroi_mode_sum(pair->j, run->steps);
-    odd = 0.5 * (run->minus - run->plus); /* eq 5.61 */
+    odd = 0.5 * (run->minus - run->plus); /* eq 5.71 */
     even = 0.5 * (run->minus + run->plus);
     product = run->power[0] * run->power[1];
     if (fabs(odd) >= 0.25 * fabs(run->minus)) run->state[1] = odd;
@@ -4625,12 +5202,12 @@ static void metroi_run_measure(const metroi_pair *pair, metroi_run_block *run)
 static metroi_run_block metroi_run_join(const metroi_pair *pair, const metroi_run_block *a, const metroi_run_block *b)
 {
     metroi_run_block ab;
-    double same = 0.5 * (a->minus + a->plus), other = a->state[1]; /* eq 5.61 */
+    double same = 0.5 * (a->minus + a->plus), other = a->state[1]; /* eq 5.71 */
     int p;
     ab.steps = a->steps + b->steps;
     for (p = 0; p < 2; p++) {
         int q = 1 - p;
-        /* eq 5.62 */
+        /* eq 5.72 */
         ab.sum[p] = a->sum[p] + same * b->sum[p] + other * b->sum[q] + a->state[p] * b->total[0] * b->total[1] +
                     a->forward[p] * b->total[1] + a->back[p] * b->total[0];
         ab.forward[p] = same * b->forward[p] + other * b->forward[q] +
@@ -4660,7 +5237,7 @@ static metroi_run_block metroi_run_make(const metroi_pair *pair, const metroi_ru
    e_1 is of the fourth order in the size while the gaps are of the second, so for small sizes it is integrated as it
    stands,
 
-       e_1 = J_{ij} - (1 - P_i)(1 - P_j), J_{ij} = int 4 sin^2(pi i u) sin^2(pi j u) P(u) du      (5.63)
+       e_1 = J_{ij} - (1 - P_i)(1 - P_j), J_{ij} = int 4 sin^2(pi i u) sin^2(pi j u) P(u) du      (5.73)
 
    over a few Gauss points, all terms positive; for the Gaussian it is P_i P_j 2 sinh^2(2 pi^2 sigma^2 i j). For large
    sizes the gaps will do: 4 sin^2(x) sin^2(y) = 2 - ... gives J = delta_i + delta_j - (delta_{i+j} + delta_{i-j})/2.
@@ -4700,7 +5277,7 @@ static double metroi_joint_von_mises(double kappa, double i, double j)
     return moment / sum;
 }
 
-/* J of eq 5.63 */
+/* J of eq 5.73 */
 static double metroi_joint_moment(const metro_kernel *k, const metroi_pair *pair, double i, double j)
 {
     double direct = pair->i.gap + pair->j.gap - 0.5 * (pair->plus.gap + pair->minus.gap), moment = -1, a, s;
@@ -4727,7 +5304,7 @@ static double metroi_joint_moment(const metro_kernel *k, const metroi_pair *pair
     return moment < 0 ? direct : (1 - k->large) * moment + k->large * (i == j ? 1.5 : 1);
 }
 
-/* What the pair (i, j) adds to M^2 Var, eq 5.60 without its factor 2 for i < j. A burn-in is a run before, whose sums
+/* What the pair (i, j) adds to M^2 Var, eq 5.70 without its factor 2 for i < j. A burn-in is a run before, whose sums
    do not count. */
 static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, const metroi_mode *mode, size_t i,
                               size_t j, uint64_t burn, uint64_t steps)
@@ -4744,7 +5321,7 @@ static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, 
     memset(&one, 0, sizeof one);
     one.steps = 1;
     metroi_run_measure(&pair, &one);
-    one.state[0] = metroi_joint_moment(k, &pair, (double)i, (double)j) - pair.i.gap * pair.j.gap; /* eq 5.63 */
+    one.state[0] = metroi_joint_moment(k, &pair, (double)i, (double)j) - pair.i.gap * pair.j.gap; /* eq 5.73 */
     one.state[1] = 0.5 * (pair.plus.gap - pair.minus.gap);
     run = metroi_run_make(&pair, &one, steps);
     even = run.sum[0];
@@ -4753,24 +5330,24 @@ static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, 
     if (burn > 0) {
         before = metroi_run_make(&pair, &one, burn);
         same = 0.5 * (before.minus + before.plus);
-        even = same * run.sum[0] + before.state[1] * run.sum[1] + before.state[0] * weight; /* eq 5.62 */
+        even = same * run.sum[0] + before.state[1] * run.sum[1] + before.state[0] * weight; /* eq 5.72 */
         odd = same * run.sum[1] + before.state[1] * run.sum[0] + before.state[1] * weight;
         weight *= before.power[0] * before.power[1];
     }
     return f->even[at] * even + f->odd[at] * odd + f->between[at] * weight;
 }
 
-/* # 5.20 A chain that starts in equilibrium
+/* # 5.21 A chain that starts in equilibrium
 
    From a uniform start there is no bias, and waves of different frequency do not correlate. One mode of power 1/2 has
    the variance T_M/(2 M^2), where T_M is the sum of P^{abs(n - n')} over all pairs of steps, again put together from
    shorter runs,
 
-       T_{m+m'} = T_m + T_{m'} + 2 P S_m(P) S_{m'}(P)                                 (5.64)
+       T_{m+m'} = T_m + T_{m'} + 2 P S_m(P) S_{m'}(P)                                 (5.74)
 
    For many steps M Var tends, from any start, to
 
-       lim M Var = sum_{i} frac{c_i^2 + s_i^2}{2} frac{1 + P_i}{1 - P_i}              (5.65)
+       lim M Var = sum_{i} frac{c_i^2 + s_i^2}{2} frac{1 + P_i}{1 - P_i}              (5.75)
 
    and M times the bias to the mean over the seeds of sum a_i P_i^b/(1 - P_i). The factor (1 + P)/(1 - P) is the
    integrated autocorrelation time of the mode (chapter 7 estimates it from draws). Bias and variance are both of the
@@ -4784,7 +5361,7 @@ static double metroi_mode_stationary(metroi_mode mode, uint64_t steps)
     while (bit <= steps / 2) bit *= 2;
     for (bit /= 2; bit > 0; bit /= 2) {
         double sum = metroi_mode_sum(mode, m);
-        total = 2 * total + 2 * mode.value * sum * sum; /* eq 5.64 */
+        total = 2 * total + 2 * mode.value * sum * sum; /* eq 5.74 */
         m *= 2;
         if (!(steps & bit)) continue;
         total += 1 + 2 * mode.value * metroi_mode_sum(mode, m);
@@ -4805,15 +5382,15 @@ static metro_run_error metroi_run_evaluate(const metroi_integrand *f, const metr
     for (i = 1; i <= f->harmonics; i++) {
         double weight = steps > 0 ? metroi_mode_sum(mode[i], steps) / m : 1 / mode[i].gap;
         if (burn > 0) weight *= metroi_mode_power(mode[i], burn);
-        if (f->mean[i - 1] != 0) metro_sum_add(&bias, f->mean[i - 1] * weight); /* eq 5.59 */
+        if (f->mean[i - 1] != 0) metro_sum_add(&bias, f->mean[i - 1] * weight); /* eq 5.69 */
         if (f->seeded && steps > 0) continue;
-        weight = (2 - mode[i].gap) / mode[i].gap; /* eq 5.65 */
+        weight = (2 - mode[i].gap) / mode[i].gap; /* eq 5.75 */
         if (steps > 0) weight = metroi_mode_stationary(mode[i], steps) / m / m;
         if (f->power[i - 1] != 0) metro_sum_add(&variance, f->power[i - 1] * weight);
     }
     for (j = 1; f->seeded && steps > 0 && j <= f->harmonics; j++)
         for (i = 1; i <= j; i++) {
-            double square = metroi_run_pair(f, k, mode, i, j, burn, steps) / m / m; /* eq 5.60 */
+            double square = metroi_run_pair(f, k, mode, i, j, burn, steps) / m / m; /* eq 5.70 */
             metro_sum_add(&variance, i < j ? 2 * square : square);
         }
     error.bias = metro_sum_value(&bias);
@@ -4866,10 +5443,10 @@ METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t b
     return METRO_OK;
 }
 
-/* # 5.21 The best size
+/* # 5.22 The best size
 
    Small steps correlate neighbours, and large ones land independently; so far the paper. But at constant importance
-   the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.65 is smallest where
+   the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.75 is smallest where
    P*(1) is most negative, at tan(pi Delta) = pi Delta, Delta = 1.4302966531242: neighbours then tend to lie on
    opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples; at Delta =
    .1 it is 121 times that of independent samples. Other importances move the best size either way (chapter 6): for a
@@ -5326,7 +5903,7 @@ METRO_API metro_result metro_operator_evolve(const metro_operator *op, uint64_t 
 
    The total variation TV is the largest error in the probability of any set whatever. The second form of the
    divergence adds only positive terms; the first one loses everything to cancellation when p is near pi. For small u
-   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$, the phi of eq 5.49. */
+   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$, the phi of eq 5.59. */
 
 METRO_API metro_distance metro_operator_distance(const metro_operator *op, const double *mass)
 {
@@ -7940,17 +8517,17 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    | paper (10) | eq 5.6 | a_0 is 1 on the unit period that the integral is taken over | `metro_operator_distance` |
    | paper (11) | eq 5.3 | 1/(2 pi) times the integral over [-pi, pi] is 1/(2 pi), not 1; on the unit period a_0 is the integral of p_n, which is 1 | `metro_startup_density` |
    | paper (12) | eq 5.7 | right on the unit period for n >= 1; infinite for n = 0; on a period of 2 pi it needs a factor 1/sqrt(2 pi) | `metro_startup_error` |
-   | paper (13) | eq 5.28 | none | `metro_chain_start_seeds` |
-   | paper (14) | eq 5.30 | period, as (5) | `metro_startup_density` |
-   | paper (15) | eq 5.31 | the sum over the seeds does not belong inside the power 2n, and x has no place in it | `metro_startup_error_seeds` |
-   | paper (16) | eq 5.16 | the condition must be abs(x - y) < Delta/2; as printed the density integrates to 2 | `metro_kernel_density` |
-   | paper (17) | eq 5.17 | right on the unit period, for Delta > 1 too | `metro_kernel_coefficient` |
+   | paper (13) | eq 5.38 | none | `metro_chain_start_seeds` |
+   | paper (14) | eq 5.40 | period, as (5) | `metro_startup_density` |
+   | paper (15) | eq 5.41 | the sum over the seeds does not belong inside the power 2n, and x has no place in it | `metro_startup_error_seeds` |
+   | paper (16) | eq 5.18 | the condition must be abs(x - y) < Delta/2; as printed the density integrates to 2 | `metro_kernel_density` |
+   | paper (17) | eq 5.19 | right on the unit period, for Delta > 1 too | `metro_kernel_coefficient` |
    | paper (18) | eq 7.1 | the sum runs to M - 1 with weights 1 - k/M, holds in stationarity, and gives a standard deviation | `metro_bernstein` |
    | paper (19) | none | none: the transport of light by bundles of rays is not part of these chapters | none |
 
    The printed algorithm of paper 1.1 has T(i -> t) in the numerator where T(t -> i) belongs, so that T cancels: eq
    4.2. By paper 2.3 the mutations should be many more than 1/Delta; diffusion needs many more than 1/Delta^2: eq
-   5.18. The apex angle of paper 3.2 is the full angle of a cone, twice the half-angle of `metro_cone_perturb`.
+   5.20. The apex angle of paper 3.2 is the full angle of a cone, twice the half-angle of `metro_cone_perturb`.
 
    # B Symbols
 

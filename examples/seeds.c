@@ -1,5 +1,5 @@
 /* seeds.c: starting from multiple seeds (section 2.1 of the paper). Its error formula, paper (15), is printed with
-   the sum over the seeds inside the power 2n; it belongs outside, as eq 5.31 has it. Left: both formulas for three
+   the sum over the seeds inside the power 2n; it belongs outside, as eq 5.41 has it. Left: both formulas for three
    seeds, and an ensemble of chains that decides between them. Right: how the error falls with the number of seeds, as
    1/sqrt(N) for seeds drawn at random, and far faster for N equispaced ones, which cancel every harmonic that N does
    not divide.
@@ -29,7 +29,7 @@ static double constant_importance(const double *z, void *sample, void *user)
     return 1;
 }
 
-/* Measures E_n at `times` looks with `chains` chains, and compares with eq 5.31. Exits with a message on failure. */
+/* Measures E_n at `times` looks with `chains` chains, and compares with eq 5.41. Exits with a message on failure. */
 static void measure(const metro_kernel *kernel, const double *seed, const double *alpha, size_t seeds,
                     const uint64_t *steps, size_t times, uint64_t chains, uint64_t random_seed, estimate *e)
 {

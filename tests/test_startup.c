@@ -108,10 +108,102 @@ static void kelemen_row(char **field, int fields)
     check_error(metro_startup_error(&k, n), metro_startup_log_error(&k, n), field[3], field[4]);
 }
 
-/* Catches: a kink of eq 5.25 left out of the panels, the first mode taken for the largest, s1 and s2 exchanged. */
+/* Catches: a kink of eq 5.27 left out of the panels, the first mode taken for the largest, s1 and s2 exchanged. */
 static void table_kelemen(void)
 {
     CHECK(check_rows("fourier_kelemen.csv", kelemen_row) == 40, "rows");
+}
+
+static void kelemen_edge_row(char **field, int fields)
+{
+    metro_kernel k = kernel_make(METRO_KELEMEN, number(field[1]), number(field[0]), 0);
+    uint64_t n = strtoull(field[2], NULL, 10);
+    double bound = 5e-13 + number(field[4]);
+    CHECK(fields == 5, "%d fields", fields);
+    if (check_scale() < 1 && n % 2 == 0) return;
+    CHECK_NEAR(metro_startup_error(&k, n), number(field[3]), bound);
+    CHECK_CLOSE(metro_startup_log_error(&k, n), log(number(field[3])), bound);
+}
+
+static void kelemen_edge_density_row(char **field, int fields)
+{
+    metro_kernel k = kernel_make(METRO_KELEMEN, number(field[1]), number(field[0]), 0);
+    uint64_t n = strtoull(field[2], NULL, 10);
+    double zero = 0, x = number(field[3]), e = metro_startup_error(&k, n / 2);
+    CHECK(fields == 5, "%d fields", fields);
+    CHECK_CLOSE(metro_startup_density(&k, n, x, &zero, NULL, 1), number(field[4]), 1e-12 * (1 + e * e));
+}
+
+/* Sizes within 1e-13 .. 1/10 of each other, and ratios to 1e60. Catches: a packet (j, m) left out or ended too early,
+   the window of the modes and that of the integral not adding up to 1, arg z with the wrong sign (densities), digits
+   of s2 - s1 lost, a panel too long for its oscillation. */
+static void kelemen_at_the_edges(void)
+{
+    CHECK(check_rows("kelemen_edges.csv", kelemen_edge_row) == 56, "rows");
+    CHECK(check_rows("kelemen_edges_density.csv", kelemen_edge_density_row) == 37, "rows");
+}
+
+/* What rests on the error at the edges: the running mean is a double sum over densities, the interval and seeds are
+   pairs of densities. Catches: C_j of the running mean without its odd orders, seeds that are paired by their sum, a
+   weight lost. */
+static void kelemen_edges_hold_together(void)
+{
+    static const double s1[6] = { 1e-9, 0.00099999, 0.2499999, 2.5e-7, 9e-6, 1.69999 };
+    static const double s2[6] = { 1e-3, 0.001, 0.25, 0.25, 1e-5, 1.7 };
+    static const double seed[3] = { 0, 0.25, 0.251 }, alpha[3] = { 0.2, 0.3, 0.5 };
+    double zero = 0, sum, pair, x0;
+    int i, j, l, n, s, burn, steps = 5;
+    for (i = 0; i < 6; i++) {
+        metro_kernel k = kernel_make(METRO_KELEMEN, s2[i], s1[i], 0), half;
+        if (check_scale() < 1 && i % 3 > 0) continue;
+        for (burn = 1; burn <= 3; burn += 2) {
+            sum = 0;
+            for (s = 2 * burn; s <= 2 * (burn + steps - 1); s++)
+                sum += (steps - abs(2 * burn + steps - 1 - s)) * (metro_startup_density(&k, (uint64_t)s, 0, &zero, NULL, 1) - 1);
+            CHECK_NEAR(steps * metro_startup_error_mean(&k, (uint64_t)burn, (uint64_t)steps), sqrt(sum), 1e-12);
+        }
+        for (n = 2; n <= 5; n += 3) {
+            sum = 0;
+            for (j = 0; j < 3; j++)
+                for (l = 0; l < 3; l++)
+                    sum += alpha[j] * alpha[l] * (metro_startup_density(&k, 2 * (uint64_t)n, seed[j], seed + l, NULL, 1) - 1);
+            CHECK_NEAR(metro_startup_error_seeds(&k, (uint64_t)n, seed, alpha, 3), sqrt(sum), 1e-12);
+            half = k;
+            half.size *= 0.5;
+            half.size_min *= 0.5;
+            x0 = 2 * half.size_min;
+            pair = metro_startup_density(&half, 2 * (uint64_t)n, 0, &zero, NULL, 1)
+                 + metro_startup_density(&half, 2 * (uint64_t)n, x0, &zero, NULL, 1);
+            CHECK_NEAR(metro_reflect_startup_error(&k, x0, (uint64_t)n), sqrt(0.5 * pair - 1), 1e-12);
+        }
+    }
+}
+
+/* The plain sum over modes is long but no match for 1e-9 where s1 and s2 are whole: against its own first terms. And
+   every value at the edges is one: no NaN, and no rise with n. Catches: eq 5.13 with k in place of k^2, a gap between
+   what the series and the far modes accept. */
+static void kelemen_has_no_gaps(void)
+{
+    static const double size[8] = { 1e-80, 1e-6, 0.01, 0.25, 0.50001, 1.7, 20, 9999 };
+    static const double ratio[9] = { 1e-15, 1e-6, 0.03, 0.5, 0.9, 0.999, 0.999999, 1 - 1e-9, 1 - 1e-14 };
+    metro_kernel k = kernel_make(METRO_KELEMEN, 3, 1.5, 0);
+    double sum = 0, p, before, at;
+    int i, j, n;
+    for (n = 20000; n >= 1; n--) {
+        p = metro_kernel_coefficient(&k, n);
+        sum += 2 * p * p * p * p * p * p;
+    }
+    CHECK_NEAR(metro_startup_error(&k, 3), sqrt(sum), 1e-12);
+    for (i = 0; i < 8; i++)
+        for (j = 0; j < 9; j++) {
+            k = kernel_make(METRO_KELEMEN, size[i], size[i] * ratio[j], 0);
+            before = infinity;
+            for (n = 1; n <= 1000 && check_scale() == 1; n = n < 4 ? n + 1 : 6 * n) {
+                at = metro_startup_log_error(&k, (uint64_t)n);
+                CHECK(at <= before, "size %g ratio %.17g n = %d: %g after %g", size[i], ratio[j], n, at, before);
+                before = at;
+            }
+        }
 }
 
 static void mixture_row(char **field, int fields)
@@ -351,7 +443,7 @@ static double mode(const metro_kernel *k, int harmonic)
 }
 
 /* The series of eq 5.7 added from its far end, for every shape, n where it converges by 20000 terms, sizes on both
-   sides of 1. Catches: a sum that stops early or on the zero of a mode, a wrong period of eq 5.14, a size taken
+   sides of 1. Catches: a sum that stops early or on the zero of a mode, a wrong period of eq 5.16, a size taken
    modulo 1 without its factor. */
 static void direct_sums_agree(void)
 {
@@ -498,7 +590,7 @@ static void equispaced_seeds_are_a_wider_kernel(void)
         }
 }
 
-/* The same, but tiny seeds: the pairs of eq 5.32 against the series at the edge of their use, and rotation, whole
+/* The same, but tiny seeds: the pairs of eq 5.42 against the series at the edge of their use, and rotation, whole
    turns, doubled seeds. Catches: a seed that is not wrapped, a pair counted once, weights not squared on the
    diagonal. */
 static void seeds_may_be_moved_and_split(void)
@@ -529,7 +621,7 @@ static void seeds_may_be_moved_and_split(void)
             }
 }
 
-/* The sum of eq 5.31 from its far end, for tiny steps (pairs) and others (modes). Catches: pairs beyond their reach,
+/* The sum of eq 5.41 from its far end, for tiny steps (pairs) and others (modes). Catches: pairs beyond their reach,
    the wrong n in one of the two ways. */
 static void seed_sums_agree(void)
 {
@@ -608,7 +700,7 @@ static void density_has_the_error(void)
 
 /* p_{n+1}(x) = int p_n(x - u) P(u) du (eq 5.1) as the mean of p_n over a grid of steps drawn by inversion. Catches: a
    density of the wrong n, a kernel of the wrong width, a wrong sign or shift of odd powers beyond Delta = 1/2, R of
-   eq 5.25 with a wrong branch. */
+   eq 5.27 with a wrong branch. */
 static void density_is_a_convolution(void)
 {
     static const metro_shape shape[3] = { METRO_UNIFORM, METRO_TRIANGLE, METRO_KELEMEN };
@@ -710,7 +802,7 @@ static void mean_is_a_double_sum(void)
 }
 
 /* Long runs against the sum over modes, from its far end, where that converges. Catches: a short circle that is too
-   short, the tail of eq 5.42 for eq 5.43, the Euler-Maclaurin panels. */
+   short, the tail of eq 5.52 for eq 5.53, the Euler-Maclaurin panels. */
 static void long_means_agree_with_modes(void)
 {
     static const double steps[5] = { 2, 1000, 1e5, 1e9, 1e18 };
@@ -820,7 +912,7 @@ static void axes_multiply(void)
 
 /* ---- Other distances ---- */
 
-/* Quadrature of eq 5.45. Catches: eq 5.48 or 5.49 without the large steps, a bound that is none for another shape. */
+/* Quadrature of eq 5.55. Catches: eq 5.58 or 5.59 without the large steps, a bound that is none for another shape. */
 static void distances_bound_the_density(void)
 {
     static const double size[5] = { 0.1, 0.35, 0.8, 1.4, 2.25 };
@@ -1019,6 +1111,9 @@ int main(void)
     CHECK_RUN(table_cauchy);
     CHECK_RUN(table_von_mises);
     CHECK_RUN(table_kelemen);
+    CHECK_RUN(kelemen_at_the_edges);
+    CHECK_RUN(kelemen_edges_hold_together);
+    CHECK_RUN(kelemen_has_no_gaps);
     CHECK_RUN(table_large_steps);
     CHECK_RUN(table_seeds);
     CHECK_RUN(table_axes);
