@@ -587,7 +587,7 @@ METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n
                                                const double *alpha, size_t seeds);
 
 /* The error of the running mean (p_burn + .. + p_{burn+steps-1})/steps, which is the density that a sample picked at
-   random among `steps` samples after a burn-in has; one seed; eq 5.48. burn = 0 includes p_0: +INFINITY. steps = 0:
+   random among `steps` samples after a burn-in has; one seed; eq 5.50. burn = 0 includes p_0: +INFINITY. steps = 0:
    NaN. Cost: at most some 400 modes while burn + steps <= 1000 (METRO_KELEMEN: some 20000 terms, but a million where
    its sizes are within some 1e-3 of each other); for tiny sizes it grows with the square root of `steps`. NaN for
    METRO_KELEMEN of such close sizes when burn + steps is above some 4000 and half a million modes would not do. */
@@ -605,7 +605,7 @@ METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double
                                        const double *alpha, size_t seeds);
 
 /* The start-up error of a chain on a torus that perturbs `axes` circle coordinates at once, coordinate i by the
-   kernel `k[i]`, from one seed: eq 5.46. NaN for axes = 0 and when one of the kernels is invalid. Cost: that of the
+   kernel `k[i]`, from one seed: eq 5.48. NaN for axes = 0 and when one of the kernels is invalid. Cost: that of the
    axes. */
 METRO_API double metro_startup_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
 METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes, uint64_t n);
@@ -618,8 +618,8 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
 
 /* Upper bounds of two other distances between p_n, from one seed, and the uniform density: the total variation (1/2)
    int abs(p_n - 1), at most min(1, E_n/2), and the Kullback-Leibler divergence int p_n ln p_n in nats, at most ln(1 +
-   E_n^2): eqs 5.56 and 5.57. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
-   5.58 and 5.59. At n = 0 the distances are 1 and +INFINITY. */
+   E_n^2): eqs 5.58 and 5.59. For METRO_UNIFORM at n = 1, with large steps or without, both are the exact values, eqs
+   5.60 and 5.61. At n = 0 the distances are 1 and +INFINITY. */
 METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n);
 METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n);
 
@@ -627,7 +627,7 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
 
 /* The start-up error of a direction, from one seed, after `n` perturbations inside a cone of `half_angle` radians:
    the L2 distance of p_n from the uniform density, both taken against the uniform probability on the sphere (for the
-   distance of the densities per steradian divide by sqrt(4 pi)), eq 5.60. And its natural logarithm, finite where the
+   distance of the densities per steradian divide by sqrt(4 pi)), eq 5.62. And its natural logarithm, finite where the
    error underflows; -INFINITY means that the error is exactly 0. n = 0 gives +INFINITY; from `half_angle` pi on and n
    >= 1 the error is exactly 0. NaN when `half_angle` is not positive and finite. Relative error 1e-12, or 1e-12 of
    the logarithm where that is larger. Cost: at most some 4000 degrees for every n and angle. The half angle is half
@@ -659,7 +659,7 @@ typedef struct {
    * mse. Errors: METRO_ERROR_ARGUMENT (invalid kernel, coefficients that are not finite, seeds or weights that
    metro_startup_error_seeds would answer by NaN, `error` NULL), METRO_ERROR_MEMORY; `error` is untouched then.
    Relative accuracy 1e-12 of each number unless terms of f cancel at the seed; a variance that is 0 is exactly 0.
-   Cost: at most two joins (eq 5.72) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
+   Cost: at most two joins (eq 5.74) for each of the harmonics^2/2 pairs and each binary digit of `burn` and `steps`,
    and some multiplications for each pair and seed; without pairs where `seeds` or `steps` is 0. Memory: 24 bytes a
    pair. */
 METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t burn, uint64_t steps,
@@ -4321,17 +4321,96 @@ METRO_API double metro_startup_log_error_seeds(const metro_kernel *k, uint64_t n
        E_n(x_0) = E_n("circle, half the size, seeds" 0 "and" x_0 "of weight" 1/2)     (5.44)
 
    because abs(A_k)^2 = cos^2(pi k x_0). From the middle, x_0 = 1/2, the odd modes vanish and the even ones are those
-   of the circle of length 1 with the kernel as it is. */
+   of the circle of length 1 with the kernel as it is.
+
+   Sizes near 1 have small even modes and seeds near the middle small odd ones. So little is then left of the sum of
+   two densities that it has lost its digits, and at six and eight uniform steps the series is long. But the even
+   modes of a width g are all modes of the width 2 g, and eq 5.20 has those to the last digit however small they are.
+   With y = abs(1/2 - x_0),
+
+       E_n^2 = frac{1}{2} (e_s(U_{2g}; 0) + e_s(U_{2g}; 2 y)) + frac{1}{2} (q_s(0) - q_s(y)), s = 2n
+       q_s(x) = frac{1}{2} (e_s(U_g; x) - e_s(U_g; x + 1/2))                          (5.45)
+
+   where q_s are the odd modes. The difference of q_s at two close places comes from its second derivative,
+
+       q_s(0) - q_s(y) = int_{0}^{y} (y - t) r(t) dt
+       r(t) = -q_s''(t) = frac{2}{g^2} (q_{s-2}(t) - frac{q_{s-2}(t + g) + q_{s-2}(t - g)}{2})      (5.46)
+
+   since (2 pi k)^2 P^s = 4 sin^2(pi k g) P^{s-2}/g^2; near 0 nothing cancels from r. Between the knots m/2 + i g of
+   the splines r is a polynomial of degree s - 3, and the Gauss rule with five points is exact for s <= 8. */
+
+/* q_s(x) for an even s <= 8 */
+static double metroi_odd_modes(double g, double s, double x)
+{
+    double a = metroi_circle_distance(x, 0), b = metroi_circle_distance(x, 0.5);
+    return 0.5 * (metroi_narrow_excess(g, s, 0, a).factor - metroi_narrow_excess(g, s, 0, b).factor);
+}
+
+/* int (y - t) r(t) dt between two neighbouring knots */
+static double metroi_odd_piece(double g, double s, double y, double from, double to)
+{
+    static const double node[3] = { 0, 0.26923465505284154552, 0.45308992296933199640 };
+    static const double weight[3] = { 0.28444444444444444444, 0.23931433524968323402, 0.11846344252809454376 };
+    double sum = 0, t, r;
+    int i;
+    for (i = -2; i <= 2; i++) {
+        t = from + (to - from) * (0.5 + (i < 0 ? -node[-i] : node[i]));
+        r = metroi_odd_modes(g, s - 2, t)
+          - 0.5 * (metroi_odd_modes(g, s - 2, t + g) + metroi_odd_modes(g, s - 2, t - g));
+        sum += weight[i < 0 ? -i : i] * (y - t) * r;
+    }
+    return (to - from) * sum * 2 / (g * g); /* eq 5.46 */
+}
+
+/* q_s(0) - q_s(y), 0 <= y <= 1/2: by the pieces from knot to next knot while y is small. */
+static double metroi_odd_difference(double g, double s, double y)
+{
+    double from = 0, to, knot, sum = 0;
+    int i, m, most = (int)s;
+    if (y > 0.05) return metroi_odd_modes(g, s, 0) - metroi_odd_modes(g, s, y);
+    while (from < y) {
+        to = y;
+        for (m = -most; m <= most; m++)
+            for (i = -most / 2; i <= most / 2; i++) {
+                knot = 0.5 * m + i * g;
+                if (knot > from && knot < to) to = knot;
+            }
+        sum += metroi_odd_piece(g, s, y, from, to);
+        from = to;
+    }
+    return sum;
+}
+
+/* E_n^2 for s = 6 or 8 steps of width g <= 1/2. */
+static metroi_scaled metroi_reflect_few(double g, double s, double x0)
+{
+    double y = fabs(0.5 - metroi_circle_distance(x0, 0));
+    metroi_scaled sum = metroi_scaled_make(0.5 * metroi_odd_difference(g, s, y), 0), even;
+    even = metroi_uniform_excess(2 * g, s, 0, 0);
+    metroi_scaled_add(&sum, 0.5 * even.factor, even.log);
+    even = metroi_uniform_excess(2 * g, s, 0, metroi_circle_distance(2 * y, 0));
+    metroi_scaled_add(&sum, 0.5 * even.factor, even.log);
+    return sum; /* eq 5.45 */
+}
 
 static metroi_scaled metroi_reflect_square(const metro_kernel *k, double x0, uint64_t n)
 {
-    double point[2] = { 0, 0 };
-    metro_kernel half = *k;
+    double point[2] = { 0, 0 }, s = 2 * (double)n, factor;
+    metro_kernel half = *k, reduced;
     metroi_seeds seeds = metroi_seeds_make(point, NULL, 2);
+    metroi_scaled square;
     if (k->shape == METRO_VON_MISES || !isfinite(x0)) return metroi_scaled_make(METROI_NAN, 0);
+    if (metroi_startup_settled(k, (double)n, &square)) return square;
     if (fabs(x0 - rint(x0)) == 0.5) return metroi_startup_square(k, n);
     half.size *= 0.5;
     half.size_min *= 0.5;
+    reduced = half;
+    factor = metroi_seeds_reduce(&reduced, &s);
+    if (reduced.shape == METRO_UNIFORM && reduced.size > 0.2 && s >= 6 && s <= 8) {
+        square = metroi_reflect_few(reduced.size, s, x0);
+        square.log += factor;
+        return square;
+    }
     point[1] = x0;
     return metroi_seeds_square(&half, n, &seeds); /* eq 5.44 */
 }
@@ -4352,12 +4431,12 @@ METRO_API double metro_reflect_startup_log_error(const metro_kernel *k, double x
    much. If a step perturbs all d coordinates at once and independently, the density of the state is the product of
    those of its coordinates, and with e_j the start-up error of coordinate j
 
-       1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.45)
+       1 + E_n^2 = prod_{j=1}^{d} (1 + e_j^2)                                         (5.47)
 
    While the e_j are large, the error grows like their product; when they are small, only like sqrt(d). We evaluate eq
-   5.45 in logarithms:
+   5.47 in logarithms:
 
-       E_n^2 = exp(sum_{j=1}^{d} ln(1 + e_j^2)) - 1                                   (5.46)
+       E_n^2 = exp(sum_{j=1}^{d} ln(1 + e_j^2)) - 1                                   (5.48)
 
    A step that perturbs only one coordinate, picked at random, is another matter. Its eigenvalues are 1 - (1/d) sum_j
    (1 - P*(k_j)), and with probability (1 - 1/d)^n a given coordinate has not been touched after n steps: p_n keeps a
@@ -4380,7 +4459,7 @@ static metroi_scaled metroi_axes_square(const metro_kernel *k, size_t axes, uint
         sum += log1p(metroi_scaled_value(e));
     }
     if (sum < 1e-17) return small;
-    if (sum < 1) return metroi_scaled_make(expm1(sum), 0); /* eq 5.46 */
+    if (sum < 1) return metroi_scaled_make(expm1(sum), 0); /* eq 5.48 */
     return sum < METROI_INFINITY ? metroi_scaled_make(-expm1(-sum), sum) : metroi_scaled_make(sum, 0);
 }
 
@@ -4399,27 +4478,27 @@ METRO_API double metro_startup_log_error_axes(const metro_kernel *k, size_t axes
    A picture averages all samples so far. A sample picked at random among the M that follow a burn-in of b has the
    density (p_b + .. + p_{b+M-1})/M, and by eq 5.5 its coefficients are geometric sums:
 
-       S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.47)
-       E^2 = 2 sum_{k=1}^{inf} S_k^2                                                  (5.48)
+       S_k = frac{1}{M} sum_{i=b}^{b+M-1} P*(k)^i = P*(k)^b frac{1 - P*(k)^M}{M (1 - P*(k))}      (5.49)
+       E^2 = 2 sum_{k=1}^{inf} S_k^2                                                  (5.50)
 
    For a mode with P near 1 this dies like tau/M, by averaging, while P^n dies exponentially; section 5.19 says what
    that means for an estimate. For M = 1 it is E_b again. With b = 0 the mean holds p_0, and its error is infinite.
 
-   At b = 1 the series is slow, like 1/k^2 for uniform steps. Squaring eq 5.47 out gives powers of P again,
+   At b = 1 the series is slow, like 1/k^2 for uniform steps. Squaring eq 5.49 out gives powers of P again,
 
-       M^2 S_k^2 = sum_{s=2b}^{2(b+M-1)} c_s P*(k)^s, c_s = min(s - 2b + 1, 2(b+M-1) - s + 1)      (5.49)
+       M^2 S_k^2 = sum_{s=2b}^{2(b+M-1)} c_s P*(k)^s, c_s = min(s - 2b + 1, 2(b+M-1) - s + 1)      (5.51)
 
    and each power, summed over k, is a value e_s(0) that we know how to find. So the first powers, which make the
    series slow, are taken out of it:
 
        M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + 2 sum_{k=1}^{inf} G_k
-       G_k = M^2 S_k^2 - sum_{s=2b}^{J} c_s P*(k)^s                                   (5.50)
+       G_k = M^2 S_k^2 - sum_{s=2b}^{J} c_s P*(k)^s                                   (5.52)
 
    Uniform steps: J = 16, triangular ones: J = 8, Kelemen's: J = 4. Where J would be under 2b nothing is taken out. On
    a shorter circle, which must hold the reach of 2(b+M-1) steps, the mode k = 0 does not drop out and all is divided
    by T, as in eq 5.16:
 
-       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + frac{1}{T} (G_0 + 2 sum_{k=1}^{inf} G_k) - G_0      (5.51)
+       M^2 E^2 = sum_{s=2b}^{J} c_s e_s(0) + frac{1}{T} (G_0 + 2 sum_{k=1}^{inf} G_k) - G_0      (5.53)
 
    With large steps everything carries (1 - p)^s; we keep (1 - p)^{2b} in front and the rest inside. */
 
@@ -4447,7 +4526,7 @@ static metroi_scaled metroi_mean_powers(const metroi_mean *mean, double last, do
         c = metroi_mean_weight(mean, i);
         if ((i + 1) * pow(ratio, i) < 1e-17) break;
         e = metroi_excess(mean->kernel, 2 * mean->burn + i, fmod(i, 2) > 0, 0);
-        metroi_scaled_add(&sum, c * e.factor, e.log); /* eq 5.49 */
+        metroi_scaled_add(&sum, c * e.factor, e.log); /* eq 5.51 */
     }
     return sum;
 }
@@ -4476,16 +4555,16 @@ static double metroi_mean_geometric(const metroi_mean *mean, double at, int sign
 /* The tails. Gaussian and von Mises modes: 1 - P grows at most like k^2, so P^b/(1 - P) falls faster than 1/k^2 and
    the terms faster than 1/k^4; for Cauchy modes it is 1/k and 1/k^2:
 
-       sum_{j>k} G_j <= frac{k}{3} (frac{P_k^b}{(1-p)(1 - P_k)})^2, "Cauchy" k "for" k/3      (5.52)
+       sum_{j>k} G_j <= frac{k}{3} (frac{P_k^b}{(1-p)(1 - P_k)})^2, "Cauchy" k "for" k/3      (5.54)
 
    Uniform and triangular modes obey the first up to the first zero of P, and from there on, as Kelemen's do from the
    start, with a bound abs(P) <= x on all modes from k on, x falling like 1/k, 1/k^2 and 1/k,
 
-       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.53)
+       sum_{j>k} G_j <= x^{J+1} frac{k}{J} (frac{J + 2 - 2b}{1 - x} + frac{x}{(1-x)^2})      (5.55)
 
    with 2 J + 1 for the J under k where x falls like 1/k^2. */
 
-/* eq 5.52 with `share` for k/3, and eq 5.53 with x = `bound` falling like 1/k^fall; logarithms. */
+/* eq 5.54 with `share` for k/3, and eq 5.55 with x = `bound` falling like 1/k^fall; logarithms. */
 
 static double metroi_mean_near(const metroi_mean *mean, double share, double at)
 {
@@ -4535,7 +4614,7 @@ static double metroi_mean_tail(const metroi_mean *mean, const metroi_spectrum *s
 static double metroi_mean_term(const metroi_mean *mean, double at, int sign)
 {
     double v, r = metroi_mean_geometric(mean, at, sign, &v);
-    return r * r - metroi_mean_polynomial(mean, v); /* eq 5.50 */
+    return r * r - metroi_mean_polynomial(mean, v); /* eq 5.52 */
 }
 
 static double metroi_mean_far_term(const metroi_far_terms *terms, double at, int sign)
@@ -4561,7 +4640,7 @@ static double metroi_mean_far_modes(const metroi_mean *mean, double period, doub
     return metroi_far_series(&terms, 0, NULL);
 }
 
-/* The series of eq 5.51 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
+/* The series of eq 5.53 without (1 - p)^{2b}; `taken` is the logarithm of what has been taken out, over the same. The
    reach counts only the steps whose weight (1 - p)^{s-2b} is above e^{-45}. */
 
 static metroi_scaled metroi_mean_series(const metroi_mean *mean, const metroi_spectrum *spectrum, double longest,
@@ -4603,14 +4682,14 @@ static metroi_scaled metroi_mean_modes(const metroi_mean *mean, double taken)
         sum = metroi_scaled_make(metroi_mean_far_modes(mean, reach < 1 ? reach : 1, longest), 0);
     }
     sum.factor *= 2;
-    if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.51 */
+    if (reach < 1) sum = metroi_scaled_make((zero + metroi_scaled_value(sum)) / reach - zero, 0); /* eq 5.53 */
     return sum;
 }
 
 /* Cauchy modes fall slowly when gamma b is small, and their powers sum slowly when M is large; but as a function of
    s, c_s e_s(0) is smooth. We add 1024 powers one by one, and the rest by Euler and Maclaurin's formula at midpoints,
 
-       sum_{i=u}^{v-1} g(i) = int_{u-1/2}^{v-1/2} g(t) dt - frac{1}{24} (g'(v - 1/2) - g'(u - 1/2)) + ...      (5.54)
+       sum_{i=u}^{v-1} g(i) = int_{u-1/2}^{v-1/2} g(t) dt - frac{1}{24} (g'(v - 1/2) - g'(u - 1/2)) + ...      (5.56)
 
    over panels that double in length, 24 Gauss points in each, the derivative taken as g(v) - g(v-1). What is left out
    is of the order of g'''/2000, and g changes over 1000 steps or more. c_s rises for i < M and falls from there; each
@@ -4637,7 +4716,7 @@ static double metroi_cauchy_slope(const metroi_mean *mean, double from, double t
         }
         slope = metroi_cauchy_power(mean, end, falling) - metroi_cauchy_power(mean, end - 1, falling)
               - metroi_cauchy_power(mean, i, falling) + metroi_cauchy_power(mean, i - 1, falling);
-        sum += panel * (end - i) - slope / 24; /* eq 5.54 */
+        sum += panel * (end - i) - slope / 24; /* eq 5.56 */
         i = end;
     }
     return sum;
@@ -4676,7 +4755,7 @@ static metroi_scaled metroi_mean_sum(metroi_mean *mean)
     if (mean->last >= 2 * (mean->steps - 1)) return sum;
     sum.log -= 2 * mean->burn * mean->log_keep;
     modes = metroi_mean_modes(mean, metroi_scaled_log(sum));
-    metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.50 */
+    metroi_scaled_add(&sum, modes.factor, modes.log); /* eq 5.52 */
     sum.log += 2 * mean->burn * mean->log_keep;
     return sum;
 }
@@ -4697,7 +4776,7 @@ static metroi_scaled metroi_mean_square(const metro_kernel *k, uint64_t burn, ui
     mean.odd_steps = (int)(steps & 1);
     mean.last = -1;
     square = metroi_mean_sum(&mean);
-    square.factor /= mean.steps * mean.steps; /* eq 5.48 */
+    square.factor /= mean.steps * mean.steps; /* eq 5.50 */
     return square;
 }
 
@@ -4745,19 +4824,19 @@ METRO_API double metro_startup_density(const metro_kernel *k, uint64_t n, double
    The paper measures the error in L2. A probabilist would ask for the total variation, the largest error of the
    probability of any event; a statistician for the Kullback-Leibler divergence:
 
-       TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.55)
+       TV = frac{1}{2} int_{0}^{1} abs(p_n(x) - 1) dx, KL = int_{0}^{1} p_n(x) ln(p_n(x)) dx      (5.57)
 
-   The L2 error bounds both distances of eq 5.55, by the inequalities of Cauchy and Schwarz and of Jensen:
+   The L2 error bounds both distances of eq 5.57, by the inequalities of Cauchy and Schwarz and of Jensen:
 
-       TV <= min(1, E_n/2)                                                            (5.56)
-       KL <= ln(1 + E_n^2)                                                            (5.57)
+       TV <= min(1, E_n/2)                                                            (5.58)
+       KL <= ln(1 + E_n^2)                                                            (5.59)
 
    For a uniform kernel at n = 1 the density has two values. With f = Delta - floor(Delta), it is 1 + q u, u = (1 -
    f)/Delta, on a part f of the circle, and 1 + q v, v = -f/Delta, on the rest, where q = 1 - p is what large steps
    leave. So
 
-       TV = q f (1 - f)/Delta                                                         (5.58)
-       KL = f phi(q u) + (1 - f) phi(q v), phi(t) = (1 + t) ln(1 + t) - t             (5.59)
+       TV = q f (1 - f)/Delta                                                         (5.60)
+       KL = f phi(q u) + (1 - f) phi(q v), phi(t) = (1 + t) ln(1 + t) - t             (5.61)
 
    and the t in phi, which cancel in the sum, keep its digits where the values of t are small; below 1/8 phi is summed
    as t^2/2 - t^3/6 + t^4/12 - ... */
@@ -4779,9 +4858,9 @@ static int metroi_startup_two_valued(const metro_kernel *k, uint64_t n)
 METRO_API double metro_startup_total_variation_bound(const metro_kernel *k, uint64_t n)
 {
     double f = k->size - floor(k->size), e;
-    if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.58 */
+    if (metroi_startup_two_valued(k, n)) return (1 - k->large) * f * (1 - f) / k->size; /* eq 5.60 */
     e = metro_startup_error(k, n);
-    return e > 2 ? 1 : 0.5 * e; /* eq 5.56 */
+    return e > 2 ? 1 : 0.5 * e; /* eq 5.58 */
 }
 
 METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t n)
@@ -4789,10 +4868,10 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
     double f = k->size - floor(k->size), q = 1 - k->large, e;
     if (metroi_startup_two_valued(k, n)) {
         double above = q * ((1 - f) / k->size), below = -q * (f / k->size);
-        return f * metroi_divergence_phi(above) + (1 - f) * metroi_divergence_phi(below); /* eq 5.59 */
+        return f * metroi_divergence_phi(above) + (1 - f) * metroi_divergence_phi(below); /* eq 5.61 */
     }
     e = metro_startup_error(k, n);
-    return log1p(e * e); /* eq 5.57 */
+    return log1p(e * e); /* eq 5.59 */
 }
 
 #undef METROI_DEBYE
@@ -4811,7 +4890,7 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
    the Fourier series: a kernel that depends on the angle alone multiplies all 2l + 1 harmonics of degree l by
    lambda_l (chapter 3). Against the uniform probability on the sphere, with p_n the density relative to it,
 
-       E_n^2 = sum_{l=1}^{inf} (2l + 1) lambda_l^{2n} = p_{2n}(0) - 1                 (5.60)
+       E_n^2 = sum_{l=1}^{inf} (2l + 1) lambda_l^{2n} = p_{2n}(0) - 1                 (5.62)
 
    where p_{2n}(0) is the density of being back at the seed. The factor 2l + 1 is the price of a second dimension: for
    a small cone some 1/alpha^2 modes wait to be forgotten, not 1/Delta.
@@ -4819,15 +4898,15 @@ METRO_API double metro_startup_divergence_bound(const metro_kernel *k, uint64_t 
    One and two steps have closed forms. Let f = sin^2(alpha/2) be the share of the sphere that the cone takes; then
    p_2(0) = 1/f, and
 
-       E_1 = cot(alpha/2)                                                             (5.61)
+       E_1 = cot(alpha/2)                                                             (5.63)
 
    For E_2 we need p_2 everywhere: at an angle theta from the seed it is the share of the sphere in which two cones,
    theta apart, overlap, over f^2. The overlap is elementary, two sectors less two triangles. With sin(theta/2) =
    sin(alpha) sin(t),
 
        f p_2 = frac{2}{pi} (atan2(cos(t), cos(alpha) sin(t)) - frac{1}{2 f} asin(A)),
-       A = frac{2 f cos(t) sin(t)}{sqrt{1 - sin^2(alpha) sin^2(t)}}                   (5.62)
-       1 + E_2^2 = 2 sin^2(alpha) int_{0}^{pi/2} p_2^2 sin(t) cos(t) dt               (5.63)
+       A = frac{2 f cos(t) sin(t)}{sqrt{1 - sin^2(alpha) sin^2(t)}}                   (5.64)
+       1 + E_2^2 = 2 sin^2(alpha) int_{0}^{pi/2} p_2^2 sin(t) cos(t) dt               (5.65)
 
    and the variable t makes the integrand so smooth that 24 Gauss points give it to rounding. The value is f (1 +
    E_2^2). */
@@ -4841,20 +4920,20 @@ static double metroi_cone_twice(double f)
         s = sin(t);
         c = cos(t);
         p = 2 / METROI_PI * (atan2(c, cosine * s) - asin(2 * f * c * s / sqrt(1 - sine * s * (sine * s))) / (2 * f));
-        sum += weight * p * p * s * c; /* eq 5.62 */
+        sum += weight * p * p * s * c; /* eq 5.64 */
     }
-    return 4 * METROI_PI * (1 - f) * sum; /* eq 5.63: sin^2(alpha) = 4 f (1 - f) */
+    return 4 * METROI_PI * (1 - f) * sum; /* eq 5.65: sin^2(alpha) = 4 f (1 - f) */
 }
 
-/* From three steps on we sum eq 5.60 relative to its first term, with the recurrence of section 3.10. Its terms fall
+/* From three steps on we sum eq 5.62 relative to its first term, with the recurrence of section 3.10. Its terms fall
    in the end like those of a Bessel function,
 
-       abs(lambda_l) <= C_b (l + 1/2)^{-3/2}, C_b = 1.16 (1 + cos(alpha)) sqrt{2/pi} sin^{-3/2}(alpha)      (5.64)
+       abs(lambda_l) <= C_b (l + 1/2)^{-3/2}, C_b = 1.16 (1 + cos(alpha)) sqrt{2/pi} sin^{-3/2}(alpha)      (5.66)
 
    (the form is the asymptotic one, Szego 1939, 8.21; the factor 1.16 was found numerically over all degrees and
    angles, 1.151 being needed), so what follows degree l is at most 2 C_b^{2n} (l + 1/2)^{2-3n}/(3n - 2). For many
    steps that bound comes late. While lambda_l/lambda_1 is above 0.3 no later one is larger, because the second lobe
-   never exceeds 0.25; up to the degree where eq 5.64 falls to lambda_l the terms are thus at most those of degree
+   never exceeds 0.25; up to the degree where eq 5.66 falls to lambda_l the terms are thus at most those of degree
    l. */
 
 static double metroi_cone_term(double gap, double n)
@@ -4874,9 +4953,9 @@ static double metroi_cone_series(double f, double n)
     double bound = log(1.16 * 2 * sqrt(2 / METROI_PI)) - 0.75 * log(4 * f * (1 - f));
     for (l = 2;; l++) {
         metroi_cone_next(&cone);
-        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n); /* eq 5.60 */
+        sum += (2 * l + 1) * metroi_cone_term(cone.gap, n); /* eq 5.62 */
         if (fmod(l, 16) > 0) continue;
-        tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.64 */
+        tail = 2 * n * bound + (2 - 3 * n) * log(l + 0.5) + log(2 / (3 * n - 2)); /* eq 5.66 */
         if (cone.gap < 0.7) {
             reach = log1p(-cone.gap);
             tail = 2 * n * reach + 4 / 3.0 * (bound - reach) + log(3);
@@ -4888,7 +4967,7 @@ static double metroi_cone_series(double f, double n)
 /* A narrow cone makes this series long. But while the chain has not come round the sphere, the return density times
    its area is a smooth function of the curvature that it has met: with tau = n f,
 
-       Phi(tau) = tau (1 + E_n^2)                                                     (5.65)
+       Phi(tau) = tau (1 + E_n^2)                                                     (5.67)
 
    is analytic at tau = 0, where the sphere is a plane (for many steps it is that of the heat kernel on the sphere, 1
    + tau/3 + tau^2/15 + ...). Below tau = h = 0.005 we therefore evaluate it at h, 2h, .. 6h, where the series has
@@ -4910,7 +4989,7 @@ static double metroi_sphere_extend(const double *phi, double x)
     return sum;
 }
 
-/* E^2 from Phi and ln tau, eq 5.65. */
+/* E^2 from Phi and ln tau, eq 5.67. */
 static metroi_scaled metroi_sphere_square(double phi, double log_tau)
 {
     if (log_tau < -40) return metroi_scaled_make(phi, -log_tau);
@@ -4922,7 +5001,7 @@ static metroi_scaled metroi_cone_square(double f, double log_f, double n)
 {
     double phi[6], tau;
     int i;
-    /* Towards the hemisphere the integrand of eq 5.63 bends too sharply for its 24 points, and the series is short */
+    /* Towards the hemisphere the integrand of eq 5.65 bends too sharply for its 24 points, and the series is short */
     if (n < 3 && f < 0.3) return metroi_sphere_square(metroi_cone_twice(f > 1e-30 ? f : 1e-30), log_f);
     if (n * f >= METROI_NEAR_PLANE) return metroi_scaled_make(1, metroi_cone_series(f, n) + 2 * n * log1p(-f));
     for (i = 1; i <= 6; i++) {
@@ -4934,7 +5013,7 @@ static metroi_scaled metroi_cone_square(double f, double log_f, double n)
 
 /* A cone wider than a hemisphere has the spectrum of the complementary one times cot^2(alpha/2), eq 3.19, so
 
-       E_n(alpha) = cot^{2n}(alpha/2) E_n(pi - alpha) "for" alpha > pi/2              (5.66)
+       E_n(alpha) = cot^{2n}(alpha/2) E_n(pi - alpha) "for" alpha > pi/2              (5.68)
 
    and from alpha = pi on a single step is uniform: the error is exactly 0. */
 
@@ -4948,13 +5027,13 @@ static metroi_scaled metroi_cone_startup(double half_angle, uint64_t n)
     if (n == 1) return metroi_scaled_make(1, 2 * (log(c) - log(s)));
     if (half_angle <= 0.5 * METROI_PI) return metroi_cone_square(s * s, 2 * log(s), steps);
     square = metroi_cone_square(c * c, 2 * log(c), steps);
-    square.log += 4 * steps * (log(c) - log(s)); /* eq 5.66 */
+    square.log += 4 * steps * (log(c) - log(s)); /* eq 5.68 */
     return square;
 }
 
 METRO_API double metro_cone_startup_error(double half_angle, uint64_t n)
 {
-    /* eq 5.61, without the detour over logarithms */
+    /* eq 5.63, without the detour over logarithms */
     if (n == 1 && half_angle > 0 && half_angle < METROI_PI) return cos(0.5 * half_angle) / sin(0.5 * half_angle);
     return metroi_scaled_root(metroi_cone_startup(half_angle, n));
 }
@@ -4964,7 +5043,7 @@ METRO_API double metro_cone_startup_log_error(double half_angle, uint64_t n)
     return metroi_scaled_root_log(metroi_cone_startup(half_angle, n));
 }
 
-/* The von Mises-Fisher kernel goes the same way with tau = n/kappa in eq 5.65, since its lambda_l is about exp(-l
+/* The von Mises-Fisher kernel goes the same way with tau = n/kappa in eq 5.67, since its lambda_l is about exp(-l
    (l+1)/(2 kappa)). At tau = h the sum needs 10 + sqrt(80/h) degrees, 137, for any n; the terms are positive and
    their logarithms concave. One step has E_1^2 = kappa lambda_1. */
 
@@ -5010,11 +5089,11 @@ METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n)
 }
 
 /* A third kernel needs no function. The phase function of Henyey and Greenstein (1941), with mean cosine g, has
-   lambda_l = g^l, so eq 5.60 is a geometric series, and
+   lambda_l = g^l, so eq 5.62 is a geometric series, and
 
-       E_n^2 = frac{x (3 - x)}{(1 - x)^2}, x = g^{2n}                                 (5.67)
+       E_n^2 = frac{x (3 - x)}{(1 - x)^2}, x = g^{2n}                                 (5.69)
 
-   By eq 5.67 a chain of such steps with g = 0.9 is within 1 % of the uniform density after 50 steps. */
+   By eq 5.69 a chain of such steps with g = 0.9 is within 1 % of the uniform density after 50 steps. */
 
 /* # 5.19 The error of a run
 
@@ -5025,19 +5104,19 @@ METRO_API double metro_vmf_startup_log_error(double kappa, uint64_t n)
    Seen from a seed x, the integrand is a sum of even and odd waves of the distance u = z - x that the chain has gone,
 
        f(x + u) = sum_{i} (a_i cos(2 pi i u) + b_i sin(2 pi i u))
-       a_i = c_i cos(2 pi i x) + s_i sin(2 pi i x), b_i = s_i cos(2 pi i x) - c_i sin(2 pi i x)      (5.68)
+       a_i = c_i cos(2 pi i x) + s_i sin(2 pi i x), b_i = s_i cos(2 pi i x) - c_i sin(2 pi i x)      (5.70)
 
    After n steps cos(2 pi i u) has the mean P_i^n, P_i short for P*(i), and the sine has the mean 0. So the mean of
    the M samples from n = b on is off by
 
        beta(x) = frac{1}{M} sum_{i} a_i P_i^b S_M(P_i),
-       S_M(P) = 1 + P + ... + P^{M-1} = frac{1 - P^M}{1 - P}                          (5.69)
+       S_M(P) = 1 + P + ... + P^{M-1} = frac{1 - P^M}{1 - P}                          (5.71)
 
    The bias of the estimate is the mean of beta over the seeds. Its variance is the variance of beta over the seeds
    plus the mean over the seeds of the variance from a given seed (the law of total variance); even and odd waves do
    not correlate, because u and -u are equally likely:
 
-       M^2 Var = sum_{i,j} (X_{ij} G_{ij} + Y_{ij} H_{ij} + Z_{ij} w_i w_j), w_i = P_i^b S_M(P_i)      (5.70)
+       M^2 Var = sum_{i,j} (X_{ij} G_{ij} + Y_{ij} H_{ij} + Z_{ij} w_i w_j), w_i = P_i^b S_M(P_i)      (5.72)
 
    where X, Y are the means of a_i a_j and b_i b_j over the seeds, Z is the covariance of a_i and a_j over them, and
    G_{ij} (H_{ij}) is the covariance of sum cos(2 pi i u_n) with sum cos(2 pi j u_n) (of the sums of sines) over the
@@ -5048,7 +5127,7 @@ typedef struct {
     int seeded;
     double *memory;
     double *power, *mean;         /* (c_i^2 + s_i^2)/2, and the mean of a_i over the seeds */
-    double *even, *odd, *between; /* X, Y, Z of eq 5.70, for i <= j at metroi_pair_index */
+    double *even, *odd, *between; /* X, Y, Z of eq 5.72, for i <= j at metroi_pair_index */
 } metroi_integrand;
 
 static size_t metroi_pair_index(size_t i, size_t j)
@@ -5064,7 +5143,7 @@ static void metroi_integrand_add(metroi_integrand *f, const double *cosine, cons
     for (i = 1; i <= f->harmonics; i++) {
         double c = metroi_cos_pi(2 * (double)i, x), s = metroi_sin_pi(2 * (double)i, x);
         double p = cosine != NULL ? cosine[i - 1] : 0, q = sine != NULL ? sine[i - 1] : 0;
-        a[i - 1] = p * c + q * s; /* eq 5.68 */
+        a[i - 1] = p * c + q * s; /* eq 5.70 */
         b[i - 1] = q * c - p * s;
         if (!pairs) f->mean[i - 1] += alpha * a[i - 1];
     }
@@ -5141,7 +5220,7 @@ static double metroi_mode_sum(metroi_mode mode, uint64_t m)
     double at = (double)m * mode.log;
     if (mode.gap == 0) return (double)m;
     if (mode.value > 0 && at > -0.7) return -expm1(at) / mode.gap;
-    return (1 - metroi_mode_power(mode, m)) / mode.gap; /* eq 5.69 */
+    return (1 - metroi_mode_power(mode, m)) / mode.gap; /* eq 5.71 */
 }
 
 /* # 5.20 Covariances by doubling
@@ -5150,7 +5229,7 @@ static double metroi_mode_sum(metroi_mode mode, uint64_t m)
    sizes and few steps it loses all digits of a variance that is itself small. We put a run together from shorter ones
    instead. Let a run of m steps be followed by one of m'. With
 
-       eta_m = frac{1}{2} (P_{i-j}^m + P_{i+j}^m), zeta_m = frac{1}{2} (P_{i-j}^m - P_{i+j}^m)      (5.71)
+       eta_m = frac{1}{2} (P_{i-j}^m + P_{i+j}^m), zeta_m = frac{1}{2} (P_{i-j}^m - P_{i+j}^m)      (5.73)
 
    which are the means of cos(2 pi i u_m) cos(2 pi j u_m) and of the product of the sines, a run of m' that starts at
    u_m instead of 0 has the even covariance eta_m G' + zeta_m H', by the addition theorem. Let e_m be the covariance
@@ -5160,7 +5239,7 @@ static double metroi_mode_sum(metroi_mode mode, uint64_t m)
        e_{m+m'} = eta_m e_{m'} + zeta_m o_{m'} + e_m P_i^{m'} P_j^{m'}
        g^{ij}_{m+m'} = eta_m g^{ij}_{m'} + zeta_m h^{ij}_{m'} + P_j^{m'} (g^{ij}_m + e_m S_{m'}(P_i))
        G_{m+m'} = G_m + eta_m G_{m'} + zeta_m H_{m'} + e_m S_{m'}(P_i) S_{m'}(P_j)
-                  + g^{ij}_m S_{m'}(P_j) + g^{ji}_m S_{m'}(P_i)                       (5.72)
+                  + g^{ij}_m S_{m'}(P_j) + g^{ji}_m S_{m'}(P_i)                       (5.74)
 
    and the same with even and odd exchanged for o (where the mean of a sine is 0, so o_m = zeta_m), h and H. For
    positive falling modes every term is positive: nothing cancels, and M steps need 2 log2(M) such steps. A run of one
@@ -5192,7 +5271,7 @@ static void metroi_run_measure(const metroi_pair *pair, metroi_run_block *run)
     run->power[1] = metroi_mode_power(pair->j, run->steps);
     run->total[0] = metroi_mode_sum(pair->i, run->steps);
     run->total[1] = metroi_mode_sum(pair->j, run->steps);
-    odd = 0.5 * (run->minus - run->plus); /* eq 5.71 */
+    odd = 0.5 * (run->minus - run->plus); /* eq 5.73 */
     even = 0.5 * (run->minus + run->plus);
     product = run->power[0] * run->power[1];
     if (fabs(odd) >= 0.25 * fabs(run->minus)) run->state[1] = odd;
@@ -5202,12 +5281,12 @@ static void metroi_run_measure(const metroi_pair *pair, metroi_run_block *run)
 static metroi_run_block metroi_run_join(const metroi_pair *pair, const metroi_run_block *a, const metroi_run_block *b)
 {
     metroi_run_block ab;
-    double same = 0.5 * (a->minus + a->plus), other = a->state[1]; /* eq 5.71 */
+    double same = 0.5 * (a->minus + a->plus), other = a->state[1]; /* eq 5.73 */
     int p;
     ab.steps = a->steps + b->steps;
     for (p = 0; p < 2; p++) {
         int q = 1 - p;
-        /* eq 5.72 */
+        /* eq 5.74 */
         ab.sum[p] = a->sum[p] + same * b->sum[p] + other * b->sum[q] + a->state[p] * b->total[0] * b->total[1] +
                     a->forward[p] * b->total[1] + a->back[p] * b->total[0];
         ab.forward[p] = same * b->forward[p] + other * b->forward[q] +
@@ -5237,7 +5316,7 @@ static metroi_run_block metroi_run_make(const metroi_pair *pair, const metroi_ru
    e_1 is of the fourth order in the size while the gaps are of the second, so for small sizes it is integrated as it
    stands,
 
-       e_1 = J_{ij} - (1 - P_i)(1 - P_j), J_{ij} = int 4 sin^2(pi i u) sin^2(pi j u) P(u) du      (5.73)
+       e_1 = J_{ij} - (1 - P_i)(1 - P_j), J_{ij} = int 4 sin^2(pi i u) sin^2(pi j u) P(u) du      (5.75)
 
    over a few Gauss points, all terms positive; for the Gaussian it is P_i P_j 2 sinh^2(2 pi^2 sigma^2 i j). For large
    sizes the gaps will do: 4 sin^2(x) sin^2(y) = 2 - ... gives J = delta_i + delta_j - (delta_{i+j} + delta_{i-j})/2.
@@ -5277,7 +5356,7 @@ static double metroi_joint_von_mises(double kappa, double i, double j)
     return moment / sum;
 }
 
-/* J of eq 5.73 */
+/* J of eq 5.75 */
 static double metroi_joint_moment(const metro_kernel *k, const metroi_pair *pair, double i, double j)
 {
     double direct = pair->i.gap + pair->j.gap - 0.5 * (pair->plus.gap + pair->minus.gap), moment = -1, a, s;
@@ -5304,7 +5383,7 @@ static double metroi_joint_moment(const metro_kernel *k, const metroi_pair *pair
     return moment < 0 ? direct : (1 - k->large) * moment + k->large * (i == j ? 1.5 : 1);
 }
 
-/* What the pair (i, j) adds to M^2 Var, eq 5.70 without its factor 2 for i < j. A burn-in is a run before, whose sums
+/* What the pair (i, j) adds to M^2 Var, eq 5.72 without its factor 2 for i < j. A burn-in is a run before, whose sums
    do not count. */
 static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, const metroi_mode *mode, size_t i,
                               size_t j, uint64_t burn, uint64_t steps)
@@ -5321,7 +5400,7 @@ static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, 
     memset(&one, 0, sizeof one);
     one.steps = 1;
     metroi_run_measure(&pair, &one);
-    one.state[0] = metroi_joint_moment(k, &pair, (double)i, (double)j) - pair.i.gap * pair.j.gap; /* eq 5.73 */
+    one.state[0] = metroi_joint_moment(k, &pair, (double)i, (double)j) - pair.i.gap * pair.j.gap; /* eq 5.75 */
     one.state[1] = 0.5 * (pair.plus.gap - pair.minus.gap);
     run = metroi_run_make(&pair, &one, steps);
     even = run.sum[0];
@@ -5330,7 +5409,7 @@ static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, 
     if (burn > 0) {
         before = metroi_run_make(&pair, &one, burn);
         same = 0.5 * (before.minus + before.plus);
-        even = same * run.sum[0] + before.state[1] * run.sum[1] + before.state[0] * weight; /* eq 5.72 */
+        even = same * run.sum[0] + before.state[1] * run.sum[1] + before.state[0] * weight; /* eq 5.74 */
         odd = same * run.sum[1] + before.state[1] * run.sum[0] + before.state[1] * weight;
         weight *= before.power[0] * before.power[1];
     }
@@ -5343,11 +5422,11 @@ static double metroi_run_pair(const metroi_integrand *f, const metro_kernel *k, 
    the variance T_M/(2 M^2), where T_M is the sum of P^{abs(n - n')} over all pairs of steps, again put together from
    shorter runs,
 
-       T_{m+m'} = T_m + T_{m'} + 2 P S_m(P) S_{m'}(P)                                 (5.74)
+       T_{m+m'} = T_m + T_{m'} + 2 P S_m(P) S_{m'}(P)                                 (5.76)
 
    For many steps M Var tends, from any start, to
 
-       lim M Var = sum_{i} frac{c_i^2 + s_i^2}{2} frac{1 + P_i}{1 - P_i}              (5.75)
+       lim M Var = sum_{i} frac{c_i^2 + s_i^2}{2} frac{1 + P_i}{1 - P_i}              (5.77)
 
    and M times the bias to the mean over the seeds of sum a_i P_i^b/(1 - P_i). The factor (1 + P)/(1 - P) is the
    integrated autocorrelation time of the mode (chapter 7 estimates it from draws). Bias and variance are both of the
@@ -5361,7 +5440,7 @@ static double metroi_mode_stationary(metroi_mode mode, uint64_t steps)
     while (bit <= steps / 2) bit *= 2;
     for (bit /= 2; bit > 0; bit /= 2) {
         double sum = metroi_mode_sum(mode, m);
-        total = 2 * total + 2 * mode.value * sum * sum; /* eq 5.74 */
+        total = 2 * total + 2 * mode.value * sum * sum; /* eq 5.76 */
         m *= 2;
         if (!(steps & bit)) continue;
         total += 1 + 2 * mode.value * metroi_mode_sum(mode, m);
@@ -5382,15 +5461,15 @@ static metro_run_error metroi_run_evaluate(const metroi_integrand *f, const metr
     for (i = 1; i <= f->harmonics; i++) {
         double weight = steps > 0 ? metroi_mode_sum(mode[i], steps) / m : 1 / mode[i].gap;
         if (burn > 0) weight *= metroi_mode_power(mode[i], burn);
-        if (f->mean[i - 1] != 0) metro_sum_add(&bias, f->mean[i - 1] * weight); /* eq 5.69 */
+        if (f->mean[i - 1] != 0) metro_sum_add(&bias, f->mean[i - 1] * weight); /* eq 5.71 */
         if (f->seeded && steps > 0) continue;
-        weight = (2 - mode[i].gap) / mode[i].gap; /* eq 5.75 */
+        weight = (2 - mode[i].gap) / mode[i].gap; /* eq 5.77 */
         if (steps > 0) weight = metroi_mode_stationary(mode[i], steps) / m / m;
         if (f->power[i - 1] != 0) metro_sum_add(&variance, f->power[i - 1] * weight);
     }
     for (j = 1; f->seeded && steps > 0 && j <= f->harmonics; j++)
         for (i = 1; i <= j; i++) {
-            double square = metroi_run_pair(f, k, mode, i, j, burn, steps) / m / m; /* eq 5.70 */
+            double square = metroi_run_pair(f, k, mode, i, j, burn, steps) / m / m; /* eq 5.72 */
             metro_sum_add(&variance, i < j ? 2 * square : square);
         }
     error.bias = metro_sum_value(&bias);
@@ -5446,7 +5525,7 @@ METRO_API metro_result metro_startup_run_error(const metro_kernel *k, uint64_t b
 /* # 5.22 The best size
 
    Small steps correlate neighbours, and large ones land independently; so far the paper. But at constant importance
-   the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.75 is smallest where
+   the best uniform perturbation is larger than the domain. For one harmonic the limit of eq 5.77 is smallest where
    P*(1) is most negative, at tan(pi Delta) = pi Delta, Delta = 1.4302966531242: neighbours then tend to lie on
    opposite sides and their errors cancel; the mean squared error is .643 of that of independent samples; at Delta =
    .1 it is 121 times that of independent samples. Other importances move the best size either way (chapter 6): for a
@@ -5903,7 +5982,7 @@ METRO_API metro_result metro_operator_evolve(const metro_operator *op, uint64_t 
 
    The total variation TV is the largest error in the probability of any set whatever. The second form of the
    divergence adds only positive terms; the first one loses everything to cancellation when p is near pi. For small u
-   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$, the phi of eq 5.59. */
+   the bracket is $u^2/2 - u^3/6 + u^4/12 - ...$, the phi of eq 5.61. */
 
 METRO_API metro_distance metro_operator_distance(const metro_operator *op, const double *mass)
 {

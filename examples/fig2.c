@@ -49,7 +49,7 @@ static double exact_error(const metro_kernel *kernel, size_t axes, uint64_t n)
     return metro_startup_error_axes(k, axes, n);
 }
 
-/* E_n^2 beyond the harmonics: all of it without what the series (12) has up to K along each axis, eq 5.46. */
+/* E_n^2 beyond the harmonics: all of it without what the series (12) has up to K along each axis, eq 5.48. */
 static double tail_beyond(const ensemble *e, uint64_t n, double exact)
 {
     double sum = 0;

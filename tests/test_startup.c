@@ -159,14 +159,16 @@ static void kelemen_edges_hold_together(void)
         for (burn = 1; burn <= 3; burn += 2) {
             sum = 0;
             for (s = 2 * burn; s <= 2 * (burn + steps - 1); s++)
-                sum += (steps - abs(2 * burn + steps - 1 - s)) * (metro_startup_density(&k, (uint64_t)s, 0, &zero, NULL, 1) - 1);
+                sum += (steps - abs(2 * burn + steps - 1 - s))
+                     * (metro_startup_density(&k, (uint64_t)s, 0, &zero, NULL, 1) - 1);
             CHECK_NEAR(steps * metro_startup_error_mean(&k, (uint64_t)burn, (uint64_t)steps), sqrt(sum), 1e-12);
         }
         for (n = 2; n <= 5; n += 3) {
             sum = 0;
             for (j = 0; j < 3; j++)
                 for (l = 0; l < 3; l++)
-                    sum += alpha[j] * alpha[l] * (metro_startup_density(&k, 2 * (uint64_t)n, seed[j], seed + l, NULL, 1) - 1);
+                    sum += alpha[j] * alpha[l]
+                         * (metro_startup_density(&k, 2 * (uint64_t)n, seed[j], seed + l, NULL, 1) - 1);
             CHECK_NEAR(metro_startup_error_seeds(&k, (uint64_t)n, seed, alpha, 3), sqrt(sum), 1e-12);
             half = k;
             half.size *= 0.5;
@@ -802,7 +804,7 @@ static void mean_is_a_double_sum(void)
 }
 
 /* Long runs against the sum over modes, from its far end, where that converges. Catches: a short circle that is too
-   short, the tail of eq 5.52 for eq 5.53, the Euler-Maclaurin panels. */
+   short, the tail of eq 5.54 for eq 5.55, the Euler-Maclaurin panels. */
 static void long_means_agree_with_modes(void)
 {
     static const double steps[5] = { 2, 1000, 1e5, 1e9, 1e18 };
@@ -853,7 +855,7 @@ static void long_means_keep_their_digits(void)
 
 /* ---- The interval and d dimensions ---- */
 
-/* Eq 5.33 with chapter 3's eigenvalues, and what follows from symmetry. Catches: x0 folded wrongly, the size not
+/* Eq 5.43 with chapter 3's eigenvalues, and what follows from symmetry. Catches: x0 folded wrongly, the size not
    halved, the middle that is not the circle. */
 static void interval_agrees_with_its_modes(void)
 {
@@ -885,6 +887,43 @@ static void interval_agrees_with_its_modes(void)
         }
 }
 
+
+/* k x less the whole number nearest to it, rounded once: as much of a sine's argument as counts. */
+static double turns_left(double k, double x)
+{
+    return fma(k, x, -rint(k * x));
+}
+
+/* Six and eight uniform steps on the interval, the seed y from the middle, by 200000 modes from the far end; sizes
+   where the even modes are small, and others. Catches: q_s(0) - q_s(y) without the factor 2/g^2, a knot left out,
+   even modes with the seed's y for 2 y, large steps or whole turns lost. */
+static void seeds_near_the_middle(void)
+{
+    static const double size[8] = { 0.9991, 0.7, 0.43, 1.3, 2.997, 1.02, 6.9, 4.04 };
+    static const double y[5] = { 0.31, 0.04, 1e-2, 1e-5, 4e-7 };
+    double sum, p, c, k;
+    int i, j, two;
+    for (i = 0; i < 8; i++)
+        for (j = 0; j < 5; j++)
+            for (two = 0; two < 2; two++) {
+                metro_shape shape = two ? METRO_TRIANGLE : METRO_UNIFORM;
+                metro_kernel kernel = kernel_make(shape, size[i], 0, i % 3 > 1 ? 0.1 : 0);
+                double x0 = 0.5 - y[j], h = 0.5 * size[i], near = 0.5 - x0;
+                if (check_scale() < 1 && (i + j) % 3 > 0) continue;
+                if (two) kernel.size *= 2;
+                sum = 0;
+                for (k = 200000; k >= 1; k--) {
+                    p = sin(pi * turns_left(k, h)) / (pi * k * h);
+                    c = fmod(k, 2) > 0 ? sin(pi * turns_left(k, near)) : cos(pi * turns_left(k, near));
+                    p *= p;
+                    sum += 2 * p * p * p * (two ? p : 1) * c * c;
+                }
+                sum *= pow(1 - kernel.large, two ? 4 : 6);
+                CHECK_NEAR(metro_reflect_startup_error(&kernel, x0, two ? 2 : 3), sqrt(sum), 1e-12);
+                CHECK_NEAR(metro_reflect_startup_error(&kernel, 1 - x0, two ? 2 : 3), sqrt(sum), 1e-9);
+            }
+}
+
 /* Catches: a product that overflows or underflows, the first kernel used for all axes. */
 static void axes_multiply(void)
 {
@@ -912,7 +951,7 @@ static void axes_multiply(void)
 
 /* ---- Other distances ---- */
 
-/* Quadrature of eq 5.55. Catches: eq 5.58 or 5.59 without the large steps, a bound that is none for another shape. */
+/* Quadrature of eq 5.57. Catches: eq 5.60 or 5.61 without the large steps, a bound that is none for another shape. */
 static void distances_bound_the_density(void)
 {
     static const double size[5] = { 0.1, 0.35, 0.8, 1.4, 2.25 };
@@ -1138,6 +1177,7 @@ int main(void)
     CHECK_RUN(long_means_agree_with_modes);
     CHECK_RUN(long_means_keep_their_digits);
     CHECK_RUN(interval_agrees_with_its_modes);
+    CHECK_RUN(seeds_near_the_middle);
     CHECK_RUN(axes_multiply);
     CHECK_RUN(distances_bound_the_density);
     CHECK_RUN(nothing_done_is_infinite);

@@ -360,7 +360,7 @@ static void run_identities(void)
     metro_startup_run_error(&k, 1, 12345, table_cosine, table_sine, 3, seed, NULL, 1, &one);
     CHECK_NEAR(one.variance, 0.65625 / 12345, 1e-13);
     CHECK(one.bias == 0, "bias %g of independent samples", one.bias);
-    /* the limit of many steps, by eq 5.75 written out, and from a run of 10^9 */
+    /* the limit of many steps, by eq 5.77 written out, and from a run of 10^9 */
     k.size = 0.2;
     metro_startup_run_error(&k, 4, 0, table_cosine, table_sine, 3, seed, NULL, 1, &limit);
     metro_startup_run_error(&k, 4, 1000000000, table_cosine, table_sine, 3, seed, NULL, 1, &one);
@@ -583,7 +583,7 @@ static void memory(void)
     CHECK(at == 3, "%ld allocations", at);
 }
 
-/* ln E_2 of a cone by eq 5.60 term by term: Legendre's recurrence, and eq 3.17 for lambda_l. */
+/* ln E_2 of a cone by eq 5.62 term by term: Legendre's recurrence, and eq 3.17 for lambda_l. */
 static double cone_two_steps(double half_angle)
 {
     double c = cos(half_angle), before = 1, here = c, next, lambda;
