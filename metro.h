@@ -739,9 +739,9 @@ typedef struct {
    sum of pi_i phi_i^2 is 1, NaN in dark cells: for large n the p_n from seed i is near pi_j (1 + lambda_2^n phi_i
    phi_j). Its sign is arbitrary. Where all cells but one are dark, gap, second, least and slowest are NaN. Returns
    METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT if the operator holds a NaN that metro_operator_make did not put there;
-   then the outputs are unchanged. Cost: about 10 cells^3 multiplications. Eigenvalues are off by some 1e-15, the gap
-   by 1e-13 of itself or by 1e-25; where several gaps are below 1e-14, as on three islands, by no more than these
-   differ. Source: Golub and Van Loan (1996), algorithms 8.3.1 and 8.3.3; eq 6.12 to eq 6.14. */
+   then the outputs are unchanged. Cost: about 10 cells^3 multiplications, and m^2 cells^2 for m islands. Eigenvalues
+   are off by some 1e-15, the gap by 1e-13 of itself or by 1e-25, also where several eigenvalues round to 1, as on
+   three islands. Source: Golub and Van Loan (1996), algorithms 8.3.1 and 8.3.3; eq 6.12 to eq 6.14. */
 METRO_API metro_result metro_operator_spectrum(const metro_operator *op, double *eigenvalue, double *slowest,
                                                metro_spectrum *spectrum);
 
@@ -6142,7 +6142,14 @@ static int metroi_tridiagonal_solve(double *d, double *e, double *q, size_t n)
    in which nothing cancels but neighbours that really are alike, and where an error of the eigenvector enters
    squared. This is Dirichlet's form: what a step smooths away of phi. The gap is its least value over all phi of mean
    0 and mean square 1, so any function that one can think of bounds the gap from above: put phi = 1 on one island and
-   -1 on the other, and only the moves across count. */
+   -1 on the other, and only the moves across count.
+
+   On three islands or more several gaps are as small, and the solver, to which all of them are 0 but for rounding,
+   may return any mixture of their eigenvectors. But the space that those span together is right. In it we look for
+   the least value of the form anew: the forms of two vectors, with the product of two differences for the square of
+   eq 6.14, are a small matrix, again with all its digits, and Jacobi's rotations (Golub and Van Loan 1996, section
+   8.4) make it diagonal. An eigenvector that is farther than D from v_2 leaves an error of (1e-15)^2/D; so all within
+   1e-16/gap take part, but none beyond 1e-3. */
 
 /* The root of P_ij, where i and j count the lit cells. */
 static double metroi_transition_root(const metro_operator *op, const size_t *lit, size_t i, size_t j)
@@ -6150,17 +6157,80 @@ static double metroi_transition_root(const metro_operator *op, const size_t *lit
     return sqrt(op->transition[lit[i] * op->cells + lit[j]]);
 }
 
-static double metroi_dirichlet_form(const metro_operator *op, const size_t *lit, size_t n, const double *v)
+static double metroi_dirichlet_form(const metro_operator *op, const size_t *lit, size_t n, const double *u,
+                                    const double *v)
 {
     metro_sum sum = { 0, 0 };
     size_t i, j;
     for (i = 0; i < n; i++)
         for (j = i + 1; j < n; j++) {
             double there = metroi_transition_root(op, lit, i, j), back = metroi_transition_root(op, lit, j, i);
-            double across = there * v[i] - back * v[j];
-            metro_sum_add(&sum, across * across); /* eq 6.14 */
+            metro_sum_add(&sum, (there * u[i] - back * u[j]) * (there * v[i] - back * v[j])); /* eq 6.14 */
         }
     return metro_sum_value(&sum);
+}
+
+/* Brings the rows of q to the front whose d is at most `bound`; returns how many they are. */
+static size_t metroi_spectrum_gather(double *d, double *q, size_t n, double bound)
+{
+    size_t count = 0, i, j;
+    double t;
+    for (i = 0; i < n; i++) {
+        if (!(d[i] <= bound)) continue;
+        for (j = 0; j < n; j++) {
+            t = q[i * n + j];
+            q[i * n + j] = q[count * n + j];
+            q[count * n + j] = t;
+        }
+        d[i] = d[count++];
+    }
+    return count;
+}
+
+/* Turns the rows x and y of q so that the element (x, y) of the matrix of their forms, m by m, becomes 0. */
+static void metroi_spectrum_turn(double *form, size_t m, double *q, size_t n, size_t x, size_t y)
+{
+    double tau = (form[y * m + y] - form[x * m + x]) / (2 * form[x * m + y]);
+    double t = copysign(1 / (fabs(tau) + hypot(1, tau)), tau), c = 1 / hypot(1, t), s = t * c, a, b;
+    size_t k;
+    for (k = 0; k < n; k++) {
+        a = q[x * n + k];
+        b = q[y * n + k];
+        q[x * n + k] = c * a - s * b;
+        q[y * n + k] = s * a + c * b;
+    }
+    a = t * form[x * m + y];
+    form[x * m + x] -= a;
+    form[y * m + y] += a;
+    for (k = 0; k < m; k++) {
+        if (k == x || k == y) continue;
+        a = form[x * m + k];
+        b = form[y * m + k];
+        form[x * m + k] = form[k * m + x] = c * a - s * b;
+        form[y * m + k] = form[k * m + y] = s * a + c * b;
+    }
+    form[x * m + y] = form[y * m + x] = 0;
+}
+
+/* Separates the first m rows of q; returns the row whose form is least. 30 rounds are never used up. */
+static size_t metroi_spectrum_separate(const metro_operator *op, const size_t *lit, size_t n, double *q, double *form,
+                                       size_t m)
+{
+    size_t x, y, round, turned = 1, least = 0;
+    for (x = 0; x < m; x++)
+        for (y = x; y < m; y++)
+            form[x * m + y] = form[y * m + x] = metroi_dirichlet_form(op, lit, n, q + x * n, q + y * n);
+    for (round = 0; round < 30 && turned > 0; round++)
+        for (turned = x = 0; x < m; x++)
+            for (y = x + 1; y < m; y++) {
+                double small = 1e-17 * sqrt(form[x * m + x]) * sqrt(form[y * m + y]);
+                if (!(fabs(form[x * m + y]) > small)) continue;
+                metroi_spectrum_turn(form, m, q, n, x, y);
+                turned++;
+            }
+    for (x = 1; x < m; x++)
+        if (form[x * m + x] < form[least * m + least]) least = x;
+    return least;
 }
 
 /* 1 - S over the cells that are not dark, and sqrt(pi) moved to 3. */
@@ -6197,7 +6267,7 @@ static void metroi_spectrum_report(const metro_operator *op, const size_t *lit, 
                                    const double *v, double *eigenvalue, double *slowest, metro_spectrum *spectrum)
 {
     size_t i;
-    spectrum->gap = n > 1 ? metroi_dirichlet_form(op, lit, n, v) : METROI_NAN;
+    spectrum->gap = n > 1 ? metroi_dirichlet_form(op, lit, n, v, v) : METROI_NAN;
     spectrum->second = 1.0 - spectrum->gap;
     spectrum->least = n > 1 ? sorted[n - 1] : METROI_NAN;
     for (i = 0; i < op->cells; i++) {
@@ -6211,12 +6281,15 @@ static void metroi_spectrum_report(const metro_operator *op, const size_t *lit, 
 static metro_result metroi_spectrum_compute(const metro_operator *op, const size_t *lit, size_t n, double *memory,
                                             double *eigenvalue, double *slowest, metro_spectrum *spectrum)
 {
-    double *a = memory, *q = a + n * n, *d = q + n * n, *sorted = d + 4 * n;
-    size_t row;
+    double *a = memory, *q = a + n * n, *d = q + n * n, *sorted = d + 4 * n, gap;
+    size_t row, many;
     metroi_spectrum_matrix(op, lit, n, a, q);
     metroi_tridiagonalize(a, q, n, d, d + n, d + 2 * n, d + 3 * n);
     if (!metroi_tridiagonal_solve(d, d + n, q, n)) return METRO_ERROR_ARGUMENT;
     row = metroi_spectrum_sort(d, n, sorted);
+    gap = metroi_dirichlet_form(op, lit, n, q + row * n, q + row * n);
+    many = metroi_spectrum_gather(d, q, n, d[row] + fmin(1e-3, 1e-16 / gap));
+    row = metroi_spectrum_separate(op, lit, n, q, a, many);
     metroi_spectrum_report(op, lit, n, sorted, q + row * n, eigenvalue, slowest, spectrum);
     return METRO_OK;
 }

@@ -553,6 +553,32 @@ static void gaps_below_rounding(void)
     }
 }
 
+static void islands_row(char **field, int fields)
+{
+    double value[64];
+    char *at = field[0], *next = at;
+    size_t n = 0;
+    metro_operator op;
+    metro_spectrum s;
+    CHECK(fields == 3, "%d fields", fields);
+    for (;; at = next) {
+        double number = strtod(at, &next);
+        if (next == at || n == 64) break;
+        value[n++] = number;
+    }
+    op = operator_of_cells(value, n, strtod(field[1], NULL));
+    CHECK(metro_operator_spectrum(&op, NULL, NULL, &s) == METRO_OK, "spectrum");
+    CHECK_NEAR(s.gap, strtod(field[2], NULL), 1e-12);
+    metro_operator_free(&op);
+}
+
+/* Gaps of 1e-9 to 1e-17 on three, four and six islands. Catches: the least eigenvector as the solver mixes it, a
+   rotation the wrong way, forms of the wrong rows. */
+static void many_islands(void)
+{
+    CHECK(check_rows("operator_islands.csv", islands_row) == 12, "rows");
+}
+
 /* One cell has no second eigenvalue, two have 1 - P_01 - P_10, an independent draw has only 1 and 0; NaN ends. */
 static void small_spectra(void)
 {
@@ -1133,6 +1159,55 @@ static double one_point(double x, void *user)
     return x > 0.5 && x < 0.5 + 1.0 / 64 ? 3 : 0;
 }
 
+static double seam_importance(double x, void *user)
+{
+    (void)user;
+    return exp(-30 * x);
+}
+
+static double seam_wave(double x, void *user)
+{
+    (void)user;
+    return cos(2 * PI * x);
+}
+
+static double seam_error(double size, uint64_t steps)
+{
+    double value[256], f[256];
+    metro_operator op;
+    metro_operator_error mean = { 0, 0, 0 };
+    size_t i;
+    for (i = 0; i < 256; i++) {
+        value[i] = seam_importance(((double)i + 0.5) / 256, NULL);
+        f[i] = seam_wave(((double)i + 0.5) / 256, NULL);
+    }
+    op = operator_of_cells(value, 256, size);
+    CHECK(metro_operator_run(&op, f, 1, steps, NULL, NULL, &mean) == METRO_OK, "run");
+    metro_operator_free(&op);
+    return mean.mse;
+}
+
+/* All importance within a thirtieth of the seam, on one side of it. Catches: a survey that misses the seam, a kernel
+   that does not wrap. */
+static void best_size_at_a_seam(void)
+{
+    static const uint64_t steps[2] = { 100, 10000 };
+    uint64_t j;
+    size_t m;
+    for (m = 0; m < 2; m++) {
+        double least = TOO_LARGE, size;
+        if (m == 1 && check_scale() < 1) continue;
+        for (size = 0.1; size < 2.01; size *= 1.1) least = fmin(least, seam_error(size, steps[m]));
+        for (j = 0; j < 5; j++) {
+            metro_best_options options = { seam_wave, NULL, 0 };
+            metro_best best;
+            options.seed = j;
+            CHECK(metro_best_size(seam_importance, NULL, steps[m], &options, &best) == METRO_OK, "best size");
+            CHECK(seam_error(best.size, steps[m]) <= least / 0.97, "jitter %d: size %g", (int)j, best.size);
+        }
+    }
+}
+
 static void best_size_defaults(void)
 {
     importance which = importance_named("peak");
@@ -1270,6 +1345,7 @@ int main(void)
     CHECK_RUN(the_atom_grows_in_l2_only);
     CHECK_RUN(spectrum_is_that_of_the_matrix);
     CHECK_RUN(gaps_below_rounding);
+    CHECK_RUN(many_islands);
     CHECK_RUN(small_spectra);
     CHECK_RUN(errors_are_sums_over_paths);
     CHECK_RUN(blocks_agree_with_steps);
@@ -1285,6 +1361,7 @@ int main(void)
     CHECK_RUN(exponential_gap_of_a_matrix);
     CHECK_RUN(chosen_sizes_are_efficient);
     CHECK_RUN(no_listed_size_is_better);
+    CHECK_RUN(best_size_at_a_seam);
     CHECK_RUN(best_size_defaults);
     CHECK_RUN(best_size_refusals);
     CHECK_RUN(every_allocation_may_fail);
