@@ -29,13 +29,13 @@ all: $(EXAMPLES) build/weave
 build out:
 	@mkdir -p $@
 
-build/test_%: tests/test_%.c tests/check.h tests/memory.h metro.h examples/plot.h | build
+build/test_%: tests/test_%.c tests/check.h tests/memory.h tests/kernels.h metro.h examples/plot.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
 build/bench_%: tests/bench_%.c metro.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
-build/calibrate_%: tests/calibrate_%.c metro.h | build
+build/calibrate_%: tests/calibrate_%.c tests/kernels.h metro.h | build
 	$(CC) $(WARNINGS) $(CFLAGS) -o $@ $< $(LDLIBS)
 
 build/weave: docs/weave.c | build

@@ -20,6 +20,8 @@
    - METRO_STATIC: all functions are static, so that several files may carry their own copy.
    - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
    - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
+   - METRO_ASSERT(condition): what to do about a programmer's error, the start of a chain that was not made; `assert`
+     otherwise.
 
    This program follows one chain, and prints beside it how much of the seed theory says is left:
 
@@ -216,8 +218,9 @@ METRO_API double metro_length(metro_vec3 a);
 METRO_API metro_vec3 metro_normalize(metro_vec3 a);
 
 /* Long runs are cut into rounds, and a round into jobs. The number of jobs is part of the problem, never of the
-   machine: a job draws from its own random stream, writes only to its own slot, and the slots are merged in the order
-   of jobs. So the answer is the same, bit for bit, on one thread or on sixty-four. */
+   machine: a job draws from its own random stream, writes only to its own slot and to what no other job of the round
+   touches, and the slots are merged in the order of jobs. So the answer is the same, bit for bit, on one thread or on
+   sixty-four. */
 typedef struct {
     uint64_t rounds;         /* how many rounds; 0 means 1 */
     uint64_t first_round;    /* the number of the first one, to go on where an earlier run ended */
@@ -225,7 +228,9 @@ typedef struct {
     size_t slot_size;        /* bytes that a job writes, a multiple of the alignment it needs; 0 is allowed */
     size_t threads;          /* 0 means one a core */
     /* Does job `job` (counted over all rounds: round * jobs + index) and leaves its outcome in `slot`, which arrives
-       zeroed. Runs on any thread, and must not write anything that `user` reaches. */
+       zeroed. Runs on any thread. Of what `user` reaches it may write only what belongs to its index, job % jobs, and
+       to no other job: a chain, say, that lives from round to round. Rounds do not overlap, so the next job of this
+       index finds what this one wrote, also when another job fails and the round is not merged. */
     metro_result (*work)(uint64_t job, void *slot, void *user);
     /* Takes the slot of one job into the result; called on the caller's thread, in the order of jobs. May be NULL. */
     metro_result (*merge)(uint64_t job, const void *slot, void *user);
@@ -505,14 +510,17 @@ METRO_API metro_result metro_chain_make(const metro_target *target, const metro_
 /* Frees what metro_chain_make allocated. A zeroed chain may be freed. */
 METRO_API void metro_chain_free(metro_chain *chain);
 
-/* Starts the chain at the state z, a point of the space, as the paper does. Returns METRO_ERROR_DARK_SEED if I(z) =
-   0, METRO_ERROR_BAD_SEED if it is negative, infinite or NaN; the chain is then where it was. A start sets the counts
-   to zero and keeps what is known of b. */
+/* Starts the chain at the state z, a point of the space, as the paper does: 0 <= z < 1 on a circle, 0 <= z <= 1 on an
+   interval, a vector of length 1 within 1e-6 for a direction. Returns METRO_ERROR_ARGUMENT for any other z or NULL (a
+   target that proposes by itself may leave the space, and its z is not looked at), METRO_ERROR_DARK_SEED if I(z) = 0,
+   METRO_ERROR_BAD_SEED if it is negative, infinite or NaN; the chain is then where it was. A start sets the counts to
+   zero and keeps what is known of b. Like a burn-in it drops what the current sample has collected since it was
+   recorded last: flush before a restart that shall keep it. */
 METRO_API metro_result metro_chain_start_point(metro_chain *chain, const double *z);
 
 /* Starts at the seed z_i, chosen with probability alpha_i (paper (13)). `seeds` states follow each other in z;
    `alpha` has `seeds` numbers whose sum is 1 within 1e-9, or is NULL for equal ones. Returns METRO_ERROR_ARGUMENT for
-   no seeds or other weights. One dark or bad seed refuses all, as in metro_chain_start_point, even one of weight 0.
+   no seeds or other weights. One seed that metro_chain_start_point would refuse refuses all, even one of weight 0.
    Cost: `seeds` + 1 importances. */
 METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double *z, const double *alpha,
                                                size_t seeds);
@@ -1042,6 +1050,10 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
 #include <pthread.h>
 #include <unistd.h>
 #endif
+#endif
+#ifndef METRO_ASSERT
+#include <assert.h>
+#define METRO_ASSERT(condition) assert(condition)
 #endif
 #ifndef METRO_MALLOC
 #define METRO_MALLOC(size) malloc(size)
@@ -2791,11 +2803,27 @@ static void metroi_chain_begin(metro_chain *chain, double importance, double sta
     memset(&chain->counts, 0, sizeof chain->counts);
 }
 
+/* Whether z is a point of the space. A target that proposes by itself knows its own space. */
+static int metroi_state_valid(const metro_target *target, const double *z)
+{
+    const metro_axis *axis = target->axes, *end = axis + target->axis_count;
+    if (z == NULL) return 0;
+    for (; target->propose == NULL && axis < end; z += metroi_axis_doubles(axis->kind), axis++) {
+        if (axis->kind == METRO_DIRECTION) {
+            double length = metro_length(metro_vec3_make(z[0], z[1], z[2]));
+            if (!(fabs(length - 1) <= 1e-6)) return 0;
+        } else if (!(*z >= 0 && *z <= 1) || (axis->kind == METRO_CIRCLE && *z == 1)) return 0;
+    }
+    return 1;
+}
+
 METRO_API metro_result metro_chain_start_point(metro_chain *chain, const double *z)
 {
     const metro_target *target = &chain->target;
     double importance;
     metro_result result;
+    METRO_ASSERT(chain->memory != NULL);
+    if (!metroi_state_valid(target, z)) return METRO_ERROR_ARGUMENT;
     memmove(chain->tentative, z, metroi_state_doubles(target) * sizeof *z);
     importance = target->importance(chain->tentative, chain->tentative_sample, target->user);
     result = metroi_seed_check(importance);
@@ -2823,10 +2851,12 @@ METRO_API metro_result metro_chain_start_seeds(metro_chain *chain, const double 
     const metro_target *target = &chain->target;
     size_t doubles = metroi_state_doubles(target), chosen = 0, i;
     double seen = 0;
+    METRO_ASSERT(chain->memory != NULL);
     if (z == NULL || !metroi_weights_valid(alpha, seeds)) return METRO_ERROR_ARGUMENT;
     for (i = 0; i < seeds; i++) {
         metro_result result;
         double weight = alpha != NULL ? alpha[i] : 1;
+        if (!metroi_state_valid(target, z + i * doubles)) return METRO_ERROR_ARGUMENT;
         result = metroi_seed_check(target->importance(z + i * doubles, chain->tentative_sample, target->user));
         if (result != METRO_OK) return result;
         /* Seed i replaces the one chosen so far with probability alpha_i / (alpha_1 + ... + alpha_i): eq 4.5 */
@@ -2868,6 +2898,7 @@ METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t can
 {
     double sum = 0, unit = 0;
     size_t i;
+    METRO_ASSERT(chain->memory != NULL);
     if (candidates == 0) return METRO_ERROR_ARGUMENT;
     memset(&chain->counts, 0, sizeof chain->counts);
     chain->importance = chain->weight = 0;
@@ -2911,6 +2942,7 @@ METRO_API void metro_chain_burn(metro_chain *chain, uint64_t steps)
 METRO_API void metro_chain_survey(metro_chain *chain, uint64_t samples)
 {
     uint64_t i;
+    METRO_ASSERT(chain->memory != NULL);
     for (i = 0; i < samples; i++) metroi_chain_candidate(chain);
 }
 

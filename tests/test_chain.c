@@ -1,10 +1,15 @@
 /* Chapter 4: the chain. */
 
+#include <setjmp.h>
+
 #include "memory.h"
 
+static jmp_buf asserted;
+#define METRO_ASSERT(condition) ((condition) ? (void)0 : longjmp(asserted, 1))
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 /* What the targets of this file share: a function of x in [0, 1) and bins that collect weights. A sample is its x. */
 typedef struct {
@@ -51,27 +56,11 @@ static lab lab_of(double (*function)(double), int bins)
     return l;
 }
 
-static metro_axis axis_of(metro_axis_kind kind, metro_shape shape, double size)
+static metro_target lab_target(const metro_axis *axes, size_t count, lab *l)
 {
-    metro_axis axis;
-    axis.kind = kind;
-    axis.kernel.shape = shape;
-    axis.kernel.size = size;
-    axis.kernel.size_min = size / 16;
-    axis.kernel.large = 0;
-    return axis;
-}
-
-static metro_target target_of(const metro_axis *axes, size_t count, lab *l)
-{
-    metro_target target;
-    memset(&target, 0, sizeof target);
-    target.axes = axes;
-    target.axis_count = count;
+    metro_target target = target_of(axes, count, lab_importance, l);
     target.sample_size = sizeof(double);
-    target.importance = lab_importance;
     target.record = lab_record;
-    target.user = l;
     return target;
 }
 
@@ -81,7 +70,7 @@ static void chain_equals_a_loop_written_by_hand(void)
 {
     lab l = lab_of(slope, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_rng rng = metro_rng_make(1, 2);
     metro_chain chain;
     double seed = .25, x = .25, bin[10] = { 0 };
@@ -137,7 +126,7 @@ static void chain_keeps_the_target(void)
         for (e = 0; e < 4; e++) {
             lab l = lab_of(slope, 4);
             metro_axis axis = axis_of(e & 1 ? METRO_INTERVAL : METRO_CIRCLE, shapes[i], .4);
-            metro_target target = target_of(&axis, 1, &l);
+            metro_target target = lab_target(&axis, 1, &l);
             options.expected_values = e & 1;
             options.large_step = e & 2 ? .2 : 0;
             expect_bins(&target, &options, &l, truth, 300);
@@ -177,7 +166,7 @@ static void asymmetric_transitions_go_through_the_ratio(void)
     const double truth[5] = { .05, .1, .15, .2, .5 };
     lab l = lab_of(ring_target, 5);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .4);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed = .5;
     target.propose = ring_propose;
@@ -199,7 +188,7 @@ static void flat_target_accepts_all(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 1.7);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed = 0;
     CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
@@ -215,7 +204,7 @@ static void squared_jump_is_exact(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axes[3];
-    metro_target target = target_of(axes, 1, &l);
+    metro_target target = lab_target(axes, 1, &l);
     metro_chain chain;
     double seed[5] = { .97, .5, 0, 0, 1 }, n = (double)check_count(100000, 5000);
     target.record = NULL;
@@ -249,7 +238,7 @@ static void bad_importances_are_rejected_and_counted(void)
 {
     lab l = lab_of(wild, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 1);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed = .5, n = (double)check_count(100000, 5000), s = sqrt(n * .1 * .9);
     int i;
@@ -291,7 +280,7 @@ static void scale_of_importance_does_not_matter(void)
     for (i = 0; i < 3; i++) {
         lab l = lab_of(functions[i], 4);
         metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
-        metro_target target = target_of(&axis, 1, &l);
+        metro_target target = lab_target(&axis, 1, &l);
         metro_chain_options options = { .3, 1 };
         metro_chain chain;
         double error, b;
@@ -314,7 +303,7 @@ static void dark_and_bad_seeds_are_refused(void)
 {
     lab l = lab_of(wild, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed[4] = { .5, .05, .15, .25 }, dark = .35, pair[2] = { .5, .35 };
     CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
@@ -329,12 +318,95 @@ static void dark_and_bad_seeds_are_refused(void)
     metro_chain_free(&chain);
 }
 
+static double anywhere(const double *z, void *sample, void *user)
+{
+    (void)z;
+    (void)sample;
+    ++*(int *)user;
+    return 1;
+}
+
+static double stay_there(const double *from, double *to, metro_rng *rng, void *user)
+{
+    (void)rng;
+    (void)user;
+    to[0] = from[0];
+    return 1;
+}
+
+/* Catches: a point outside the space that is taken or handed to the importance, an end of the interval or a direction
+   in single precision that is refused, a space of the target's own that is looked at. */
+static void seeds_outside_the_space_are_refused(void)
+{
+    static const double wrong[9] = { -1e-9, 1, 1.5, -1, (double)NAN, (double)INFINITY, -(double)INFINITY, 3, 1e300 };
+    int calls = 0, i;
+    metro_axis axes[3], circle = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
+    metro_target target = target_of(axes, 3, anywhere, &calls);
+    metro_chain chain;
+    double z[10] = { 0, 1, .6, 0, -.8, 0, 1, .6, 0, -.8 };
+    axes[0] = circle;
+    axes[1] = axis_of(METRO_INTERVAL, METRO_UNIFORM, .3);
+    axes[2] = axis_of(METRO_DIRECTION, METRO_UNIFORM, .3);
+    CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
+    CHECK(metro_chain_start_point(&chain, z) == METRO_OK && calls == 1, "the ends belong to the space");
+    CHECK(metro_chain_start_point(&chain, NULL) == METRO_ERROR_ARGUMENT, "no point");
+    for (i = 0; i < 9; i++) {
+        z[5] = wrong[i];
+        CHECK(metro_chain_start_point(&chain, z + 5) == METRO_ERROR_ARGUMENT, "%g on the circle", wrong[i]);
+        z[5] = 0;
+        z[6] = wrong[i];
+        if (i != 1) CHECK(metro_chain_start_point(&chain, z + 5) == METRO_ERROR_ARGUMENT, "%g on the interval", z[6]);
+        CHECK(i == 1 || metro_chain_start_seeds(&chain, z, NULL, 2) == METRO_ERROR_ARGUMENT, "one of two seeds");
+        z[6] = 1;
+        z[8] = wrong[i];
+        if (i > 0) CHECK(metro_chain_start_point(&chain, z + 5) == METRO_ERROR_ARGUMENT, "%g in a direction", z[8]);
+        z[8] = 0;
+    }
+    z[7] = (double)0.6f;
+    z[9] = (double)-0.8f;
+    calls = 0;
+    CHECK(metro_chain_start_point(&chain, z + 5) == METRO_OK && calls == 1, "single precision");
+    CHECK(chain.state[2] == z[7], "the point is taken as it is");
+    metro_chain_free(&chain);
+    target = target_of(&circle, 1, anywhere, &calls);
+    target.propose = stay_there;
+    z[0] = -7;
+    CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
+    CHECK(metro_chain_start_point(&chain, z) == METRO_OK, "a space of its own");
+    metro_chain_free(&chain);
+}
+
+/* Catches: a restart that records, or keeps for the new sample, what the old one has collected; a refused one that
+   drops it; a flush that does not keep it. */
+static void restart_drops_what_is_not_flushed(void)
+{
+    lab l = lab_of(half_dark, 10);
+    metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 1e-9);
+    metro_target target = lab_target(&axis, 1, &l);
+    metro_chain chain;
+    double seed = .25, dark = .75;
+    int i, k;
+    CHECK(metro_chain_make(&target, NULL, metro_rng_make(1, 1), &chain) == METRO_OK, "make");
+    for (k = 0; k < 2; k++) {
+        CHECK(metro_chain_start_point(&chain, &seed) == METRO_OK, "start");
+        for (i = 0; i < 10; i++) metro_chain_step(&chain);
+        CHECK(l.total == 9 + 10 * k, "ten steps, the last one pending: %g", l.total);
+        CHECK(metro_chain_start_point(&chain, &dark) == METRO_ERROR_DARK_SEED && chain.weight == 1, "refused");
+        if (k == 0) metro_chain_flush(&chain);
+    }
+    CHECK(l.total == 19, "after the flush: %g", l.total);
+    CHECK(metro_chain_start_point(&chain, &seed) == METRO_OK && chain.weight == 0, "restart");
+    metro_chain_run(&chain, 10);
+    CHECK(l.total == 29, "one step was dropped: %g", l.total);
+    metro_chain_free(&chain);
+}
+
 /* Catches: seeds chosen with the wrong probability, alpha that is no distribution. */
 static void seeds_are_chosen_by_alpha(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed[4] = { .1, .2, .3, .4 }, alpha[4] = { .1, 0, .65, .25 }, off[4] = { .1, 0, .65, .25 + 2e-9 };
     double count[4] = { 0 }, n = (double)check_count(40000, 4000);
@@ -363,7 +435,7 @@ static void weighted_seeds_are_unbiased_at_every_step(void)
 {
     lab l = lab_of(slope, 20);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .1);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     size_t candidates[] = { 1, 2, 5 };
     int steps[] = { 1, 3, 20 };
     int c, s;
@@ -399,7 +471,7 @@ static void dark_candidates_belong_to_the_mean(void)
 {
     lab l = lab_of(half_dark, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .1);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_moments mean = { 0, 0, 0, 0 };
     uint64_t run, runs = check_count(20000, 1000), none = 0;
     metro_chain chain;
@@ -428,7 +500,7 @@ static void b_comes_with_its_error(void)
 {
     lab l = lab_of(slope, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .1);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain_options options = { .25, 0 };
     metro_chain chain;
     metro_moments b = { 0, 0, 0, 0 };
@@ -456,7 +528,7 @@ static void large_steps_redraw_all_axes(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axes[3];
-    metro_target target = target_of(axes, 3, &l);
+    metro_target target = lab_target(axes, 3, &l);
     metro_chain_options options = { .25, 0 };
     metro_chain chain;
     double z[5], n = (double)check_count(40000, 2000), far = 0;
@@ -493,7 +565,7 @@ static void expected_values_lower_the_variance(void)
         for (run = 0; run < runs; run++) {
             lab l = lab_of(slope, 2);
             metro_axis axis = axis_of(METRO_INTERVAL, METRO_UNIFORM, 1.5);
-            metro_target target = target_of(&axis, 1, &l);
+            metro_target target = lab_target(&axis, 1, &l);
             metro_chain_options options = { 0, 0 };
             metro_chain chain;
             options.expected_values = e;
@@ -515,7 +587,7 @@ static void counts_are_kept(void)
 {
     lab l = lab_of(half_dark, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 1);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain chain;
     double seed = .2;
     uint64_t longest = 0, stay = 0, i;
@@ -543,7 +615,7 @@ static void chains_refuse_nonsense(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .1);
-    metro_target target = target_of(&axis, 1, &l), bad;
+    metro_target target = lab_target(&axis, 1, &l), bad;
     metro_chain_options options = { 1.5, 0 };
     metro_chain chain;
     metro_rng rng = metro_rng_make(1, 1);
@@ -587,12 +659,26 @@ static void chains_refuse_nonsense(void)
     metro_chain_free(&chain);
 }
 
+/* Catches: an assertion that holds for a chain that was not made, or for one that was freed. */
+static void a_chain_that_was_not_made_is_asserted(void)
+{
+    static volatile int caught = 0;
+    static metro_chain chain;
+    double z = .5;
+    if (setjmp(asserted)) caught++;
+    if (caught == 0) metro_chain_start_point(&chain, &z);
+    if (caught == 1) metro_chain_start_seeds(&chain, &z, NULL, 1);
+    if (caught == 2) metro_chain_start_weighted(&chain, 1);
+    if (caught == 3) metro_chain_survey(&chain, 1);
+    CHECK(caught == 4, "%d of four", caught);
+}
+
 /* Large steps alone are independent sampling. Catches: a large step that depends on where the chain is. */
 static void only_large_steps_are_independent(void)
 {
     lab l = lab_of(flat, 10);
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .01);
-    metro_target target = target_of(&axis, 1, &l);
+    metro_target target = lab_target(&axis, 1, &l);
     metro_chain_options options = { 1, 0 };
     metro_chain chain;
     double seed = .5, last, product = 0, n = (double)check_count(100000, 3000);
@@ -619,6 +705,8 @@ int main(void)
     CHECK_RUN(acceptance_survives_huge_ratios);
     CHECK_RUN(scale_of_importance_does_not_matter);
     CHECK_RUN(dark_and_bad_seeds_are_refused);
+    CHECK_RUN(seeds_outside_the_space_are_refused);
+    CHECK_RUN(restart_drops_what_is_not_flushed);
     CHECK_RUN(seeds_are_chosen_by_alpha);
     CHECK_RUN(weighted_seeds_are_unbiased_at_every_step);
     CHECK_RUN(dark_candidates_belong_to_the_mean);
@@ -627,6 +715,7 @@ int main(void)
     CHECK_RUN(expected_values_lower_the_variance);
     CHECK_RUN(counts_are_kept);
     CHECK_RUN(chains_refuse_nonsense);
+    CHECK_RUN(a_chain_that_was_not_made_is_asserted);
     CHECK_RUN(only_large_steps_are_independent);
     return check_done("chain");
 }

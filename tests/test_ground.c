@@ -167,6 +167,54 @@ static void rounds_refuse_nonsense(void)
     CHECK(metro_core_count() >= 1, "cores");
 }
 
+/* One stream an index, which goes on from round to round. */
+typedef struct {
+    metro_rng rng[5];
+    uint64_t drawn[5], fold;
+} walkers;
+
+static metro_result walk_on(uint64_t job, void *slot, void *user)
+{
+    walkers *w = (walkers *)user;
+    size_t i, index = (size_t)(job % 5);
+    for (i = 0; i < 1000 * (index + 1); i++) *(uint64_t *)slot += metro_rng_next(&w->rng[index]);
+    w->drawn[index] += i;
+    return METRO_OK;
+}
+
+static metro_result fold_walk(uint64_t job, const void *slot, void *user)
+{
+    walkers *w = (walkers *)user;
+    w->fold = w->fold * 31 + *(const uint64_t *)slot + job;
+    return METRO_OK;
+}
+
+/* Catches: two jobs of one index at work at once, rounds that overlap. */
+static void jobs_may_keep_what_is_theirs(void)
+{
+    static const size_t threads[4] = { 1, 2, 3, 8 };
+    uint64_t fold = 0;
+    size_t i, k;
+    for (k = 0; k < 4; k++) {
+        walkers w;
+        metro_rounds plan = plan_of(20, 5, threads[k]);
+        memset(&w, 0, sizeof w);
+        for (i = 0; i < 5; i++) w.rng[i] = metro_rng_make(3, i);
+        plan.work = walk_on;
+        plan.merge = fold_walk;
+        CHECK(metro_rounds_run(&plan, &w) == METRO_OK, "walk");
+        for (i = 0; i < 5; i++) {
+            metro_rng straight = metro_rng_make(3, i);
+            uint64_t j;
+            CHECK(w.drawn[i] == 20000 * (i + 1), "walker %d drew %g", (int)i, (double)w.drawn[i]);
+            for (j = 0; j < w.drawn[i]; j++) metro_rng_next(&straight);
+            CHECK(metro_rng_next(&straight) == metro_rng_next(&w.rng[i]), "walker %d is elsewhere", (int)i);
+        }
+        if (k == 0) fold = w.fold;
+        CHECK(w.fold == fold, "%d threads give another walk", (int)threads[k]);
+    }
+}
+
 /* Catches: a failed allocation that is used, and memory that a failure leaks. */
 static void rounds_survive_failing_allocations(void)
 {
@@ -193,6 +241,7 @@ int main(void)
     CHECK_RUN(rounds_go_on_where_they_ended);
     CHECK_RUN(rounds_stop_and_fail_cleanly);
     CHECK_RUN(rounds_refuse_nonsense);
+    CHECK_RUN(jobs_may_keep_what_is_theirs);
     CHECK_RUN(rounds_survive_failing_allocations);
     return check_done("ground");
 }
