@@ -4,6 +4,7 @@
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
+#include "kernels.h"
 
 enum { RUNS = 4000 };
 
@@ -45,21 +46,11 @@ static double flat(const double *z, void *sample, void *user)
     return 1;
 }
 
-static metro_target target_of(const metro_axis *axis, double (*importance)(const double *, void *, void *))
-{
-    metro_target target;
-    memset(&target, 0, sizeof target);
-    target.axes = axis;
-    target.axis_count = 1;
-    target.importance = importance;
-    return target;
-}
-
 /* b from the large steps of a chain of 400 steps. */
 static void study_of_b(void)
 {
-    metro_axis axis = { METRO_CIRCLE, { METRO_UNIFORM, 0.1, 0, 0 } };
-    metro_target target = target_of(&axis, slope);
+    metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 0.1);
+    metro_target target = target_of(&axis, 1, slope, NULL);
     metro_chain_options options = { 0.3, 0 };
     study s;
     int run;
@@ -81,8 +72,8 @@ static void study_of_b(void)
 static void study_of_mcse(size_t draws)
 {
     static double draw[4 * 4000];
-    metro_axis axis = { METRO_INTERVAL, { METRO_UNIFORM, 0.5, 0, 0 } };
-    metro_target target = target_of(&axis, slope);
+    metro_axis axis = axis_of(METRO_INTERVAL, METRO_UNIFORM, 0.5);
+    metro_target target = target_of(&axis, 1, slope, NULL);
     char what[64];
     study s;
     int run, c;
@@ -116,8 +107,8 @@ static void study_of_mcse(size_t draws)
 /* E_n^2 from an ensemble of 1280 chains, where it is large and where it is gone. */
 static void study_of_ensembles(uint64_t n)
 {
-    metro_axis axis = { METRO_CIRCLE, { METRO_UNIFORM, 0.3, 0, 0 } };
-    metro_target target = target_of(&axis, flat);
+    metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, 0.3);
+    metro_target target = target_of(&axis, 1, flat, NULL);
     metro_ensemble ensemble;
     double seed = 0.1, truth = 0;
     char what[64];

@@ -3,6 +3,7 @@
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 typedef double function_of_x(double x);
 
@@ -28,28 +29,6 @@ static double peak(double x) { return .01 + exp(-(x - .5) * (x - .5) / (2 * .02 
 static double huge_peak(double x) { return 1e290 * peak(x); }
 static double slope(double x) { return .2 + x; }
 
-static metro_axis axis_of(metro_axis_kind kind, metro_shape shape, double size)
-{
-    metro_axis axis;
-    axis.kind = kind;
-    axis.kernel.shape = shape;
-    axis.kernel.size = size;
-    axis.kernel.size_min = size / 16;
-    axis.kernel.large = 0;
-    return axis;
-}
-
-static metro_target target_of(const metro_axis *axes, size_t count, function_of_x **function)
-{
-    metro_target target;
-    memset(&target, 0, sizeof target);
-    target.axes = axes;
-    target.axis_count = count;
-    target.importance = call_importance;
-    target.user = function;
-    return target;
-}
-
 static metro_balance balance_of(const metro_target *target,
                                 void (*step)(const double *, double *, metro_rng *, void *), size_t cells)
 {
@@ -71,7 +50,7 @@ static void balanced_chains_pass(void)
     for (s = 0; s < 6; s++)
         for (f = 0; f < 4; f++) {
             metro_axis axis = axis_of(s < 5 && f % 2 ? METRO_INTERVAL : METRO_CIRCLE, shapes[s], s == 5 ? 10 : .15);
-            metro_target target = target_of(&axis, 1, &functions[f]);
+            metro_target target = target_of(&axis, 1, call_importance, &functions[f]);
             metro_balance balance = balance_of(&target, NULL, 32);
             CHECK(balance.probability > 1e-6, "shape %d on function %d: chi-square %g of %g, probability %g", s, f,
                   balance.chi_square, balance.freedom, balance.probability);
@@ -84,7 +63,7 @@ static void balance_of_directions(void)
 {
     metro_axis axes[2];
     function_of_x *function = tilted;
-    metro_target target = target_of(axes, 2, &function);
+    metro_target target = target_of(axes, 2, call_importance, &function);
     metro_balance balance;
     axes[0] = axis_of(METRO_DIRECTION, METRO_UNIFORM, .5);
     axes[1] = axis_of(METRO_DIRECTION, METRO_VON_MISES, 8);
@@ -152,16 +131,16 @@ static void planted_mistakes_are_found(void)
     metro_axis interval = axis_of(METRO_INTERVAL, METRO_UNIFORM, .3),
                circle = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
     function_of_x *function = flat;
-    metro_target target = target_of(&interval, 1, &function);
+    metro_target target = target_of(&interval, 1, call_importance, &function);
     metro_balance balance;
     expect_unbalanced("clamping", &target, clamp_to_border);
-    target = target_of(&circle, 1, &function);
+    target = target_of(&circle, 1, call_importance, &function);
     function = slope;
     expect_unbalanced("repeating a rejected step", &target, repeat_until_accepted);
     target.propose = drift;
     expect_unbalanced("a drift without its ratio", &target, NULL);
     function = inside;
-    target = target_of(&interval, 1, &function);
+    target = target_of(&interval, 1, call_importance, &function);
     target.propose = multiply_upside_down;
     expect_unbalanced("a ratio upside down", &target, NULL);
     target.propose = multiply;
@@ -174,7 +153,7 @@ static void probabilities_are_uniform(void)
 {
     metro_axis axis = axis_of(METRO_INTERVAL, METRO_UNIFORM, .2);
     function_of_x *function = slope;
-    metro_target target = target_of(&axis, 1, &function);
+    metro_target target = target_of(&axis, 1, call_importance, &function);
     int i, n = (int)check_count(400, 40), low = 0;
     for (i = 0; i < n; i++) {
         metro_balance balance;
@@ -189,7 +168,7 @@ static void balance_refuses_nonsense(void)
 {
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .2);
     function_of_x *function = nowhere;
-    metro_target target = target_of(&axis, 1, &function);
+    metro_target target = target_of(&axis, 1, call_importance, &function);
     metro_balance balance;
     metro_rng rng = metro_rng_make(1, 1);
     CHECK(metro_balance_check(&target, NULL, 100, 16, rng, &balance) == METRO_ERROR_NO_IMPORTANCE, "dark");
@@ -242,7 +221,7 @@ static void expect_theory(const metro_axis *axes, size_t count, const double *se
 {
     static const uint64_t steps[4] = { 1, 2, 4, 9 };
     function_of_x *function = flat;
-    metro_target target = target_of(axes, count, &function);
+    metro_target target = target_of(axes, count, call_importance, &function);
     metro_chain_options options = { 0, 0 };
     metro_ensemble ensemble;
     metro_result result;
@@ -304,7 +283,7 @@ static void planted_mistakes_miss_the_theory(void)
     double seed = .1, squared, error, truth;
     metro_axis axis = axis_of(METRO_INTERVAL, METRO_UNIFORM, .3);
     function_of_x *function = flat;
-    metro_target target = target_of(&axis, 1, &function);
+    metro_target target = target_of(&axis, 1, call_importance, &function);
     metro_ensemble ensemble;
     memset(&ensemble, 0, sizeof ensemble);
     target.propose = clamped;
@@ -334,7 +313,7 @@ static void stated_errors_are_those_seen(void)
     double seed = .1;
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
     function_of_x *function = flat;
-    metro_target target = target_of(&axis, 1, &function);
+    metro_target target = target_of(&axis, 1, call_importance, &function);
     metro_ensemble ensemble;
     metro_moments estimate[2] = { { 0, 0, 0, 0 }, { 0, 0, 0, 0 } };
     double variance[2] = { 0, 0 };
@@ -367,7 +346,7 @@ static void ensembles_are_repeatable_and_careful(void)
     double seed[3] = { .1, 0, 0 }, one[2], two[2], error[2];
     metro_axis axis = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
     function_of_x *function = flat;
-    metro_target target = target_of(&axis, 1, &function);
+    metro_target target = target_of(&axis, 1, call_importance, &function);
     metro_ensemble ensemble;
     memset(&ensemble, 0, sizeof ensemble);
     ensemble.target = &target;

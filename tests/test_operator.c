@@ -5,6 +5,7 @@
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 #define PI 3.14159265358979323846
 #define NOT_A_NUMBER ((double)NAN)
@@ -43,15 +44,6 @@ static double importance_at(double x, void *user)
     case 't': return i->a + bump(x - 0.25, i->b) + bump(x - 0.75, i->b);
     default: return 1;
     }
-}
-
-static metro_kernel uniform_kernel(double size)
-{
-    metro_kernel kernel;
-    kernel.shape = METRO_UNIFORM;
-    kernel.size = size;
-    kernel.size_min = kernel.large = 0;
-    return kernel;
 }
 
 /* The operator of an importance at the middles of n cells. */
@@ -1187,8 +1179,7 @@ static double seam_error(double size, uint64_t steps)
     return mean.mse;
 }
 
-/* All importance within a thirtieth of the seam, on one side of it. Catches: a survey that misses the seam, a kernel
-   that does not wrap. */
+/* All importance within some thirtieths of the seam, on one side of it. Catches: an integrand that is not asked. */
 static void best_size_at_a_seam(void)
 {
     static const uint64_t steps[2] = { 100, 10000 };

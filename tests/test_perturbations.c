@@ -4,6 +4,7 @@
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 #define CHECK_PI 3.14159265358979323846
 
@@ -11,23 +12,13 @@ static const char *const shape_name[6] = { "uniform", "triangle", "gaussian", "c
 static const metro_shape shape_value[6] = { METRO_UNIFORM, METRO_TRIANGLE,  METRO_GAUSSIAN,
                                             METRO_CAUCHY,  METRO_VON_MISES, METRO_KELEMEN };
 
-static metro_kernel kernel_make(metro_shape shape, double size_min, double size, double large)
-{
-    metro_kernel k;
-    k.shape = shape;
-    k.size = size;
-    k.size_min = size_min;
-    k.large = large;
-    return k;
-}
-
 /* Kernels of all six shapes: narrow, of the order of the domain, wider than it. */
 static metro_kernel kernel_case(int i)
 {
     static const double length[3] = { 0.06, 0.43, 2.7 }, kappa[3] = { 300.0, 4.0, 0.0 };
     metro_shape shape = shape_value[i / 3];
     double size = shape == METRO_VON_MISES ? kappa[i % 3] : length[i % 3];
-    return kernel_make(shape, size / 10, size, 0);
+    return kernel_make(shape, size, size / 10, 0);
 }
 
 #define KERNEL_CASES 18
@@ -37,7 +28,7 @@ static int kernel_parse(const char *name, const char *first, const char *second,
     int i;
     for (i = 0; i < 6; i++) {
         if (strcmp(name, shape_name[i]) != 0) continue;
-        *k = kernel_make(shape_value[i], atof(first), i == 5 ? atof(second) : atof(first), 0);
+        *k = kernel_make(shape_value[i], i == 5 ? atof(second) : atof(first), atof(first), 0);
         return 1;
     }
     return 0;
@@ -49,7 +40,7 @@ static int kernel_parse(const char *name, const char *first, const char *second,
    difference of cosine integrals where it cancels, Bessel ratios from too near, the apex angle for the half angle. */
 static void coefficient_row(char **field, int fields)
 {
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 1, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 1, 0, 0);
     double value, truth = atof(field[4]), p = atof(field[1]);
     CHECK(fields == 5, "%d fields", fields);
     if (kernel_parse(field[0], field[1], field[2], &k)) value = metro_kernel_coefficient(&k, atol(field[3]));
@@ -142,16 +133,16 @@ static void coefficient_forms(void)
     }
     for (h = 1; h < 20; h++) {
         double x = (double)h * 0.43, v;
-        k = kernel_make(METRO_TRIANGLE, 0, 0.43, 0);
-        u = kernel_make(METRO_UNIFORM, 0, 0.215, 0);
+        k = kernel_make(METRO_TRIANGLE, 0.43, 0, 0);
+        u = kernel_make(METRO_UNIFORM, 0.215, 0, 0);
         v = metro_kernel_coefficient(&u, h);
         CHECK_NEAR(metro_kernel_coefficient(&k, h), v * v, 1e-15);
-        k = kernel_make(METRO_GAUSSIAN, 0, 0.043, 0);
+        k = kernel_make(METRO_GAUSSIAN, 0.043, 0, 0);
         CHECK_NEAR(metro_kernel_coefficient(&k, h), exp(-2 * CHECK_PI * CHECK_PI * x * x * 0.01), 1e-13);
-        k = kernel_make(METRO_CAUCHY, 0, 0.43, 0);
+        k = kernel_make(METRO_CAUCHY, 0.43, 0, 0);
         CHECK_NEAR(metro_kernel_coefficient(&k, h), exp(-2 * CHECK_PI * x), 1e-13);
         for (i = 1; i <= 3; i++) {
-            k = kernel_make(METRO_UNIFORM, 0, i, 0);
+            k = kernel_make(METRO_UNIFORM, i, 0, 0);
             CHECK(metro_kernel_coefficient(&k, h) == 0, "uniform %d is independent sampling", i);
         }
         CHECK(metro_cone_coefficient(4.0, (int)h) == 0 && metro_vmf_coefficient(0, (int)h) == 0,
@@ -279,7 +270,7 @@ static void density_images(void)
         if (shape_value[s] == METRO_VON_MISES) continue;
         for (i = 0; i < 4; i++) {
             for (j = 0; j < 4; j++) {
-                metro_kernel k = kernel_make(shape_value[s], size[i] / 7, size[i], 0);
+                metro_kernel k = kernel_make(shape_value[s], size[i], size[i] / 7, 0);
                 double sum = 0, bound = 1e-13;
                 reach = s == 3 ? 200000 : 400;
                 for (m = reach; m > 0; m--)
@@ -295,7 +286,7 @@ static void density_images(void)
     }
     {
         /* a million turns of Kelemen's kernel: sums of 1/(m + d) by pairs, Euler-Maclaurin end */
-        metro_kernel k = kernel_make(METRO_KELEMEN, 0.3, 1000000.0, 0);
+        metro_kernel k = kernel_make(METRO_KELEMEN, 1000000.0, 0.3, 0);
         double sum = 0;
         for (m = 999999; m >= 0; m--) sum += 1 / ((double)m + 0.4) + 1 / ((double)m + 0.6);
         CHECK_NEAR(metro_kernel_density(&k, 0, 0.4), sum / (2 * log(1000000.0 / 0.3)), 1e-13);
@@ -304,7 +295,7 @@ static void density_images(void)
         /* von Mises against its Fourier series and against exp(kappa cos) / I_0, I_0 by its power series */
         static const double kappa[4] = { 0, 0.5, 3, 12 };
         for (i = 0; i < 4; i++) {
-            metro_kernel k = kernel_make(METRO_VON_MISES, 0, kappa[i], 0);
+            metro_kernel k = kernel_make(METRO_VON_MISES, kappa[i], 0, 0);
             double term = 1, bessel = 1;
             for (j = 1; j < 80; j++) bessel += term *= 0.25 * kappa[i] * kappa[i] / ((double)j * j);
             for (j = 0; j < 4; j++)
@@ -317,7 +308,7 @@ static void density_images(void)
 /* At a jump the mean of both sides, also where several images meet; atoms. */
 static void density_jumps(void)
 {
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 0.25, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 0.25, 0, 0);
     CHECK(metro_kernel_density(&k, 0, 0.125) == 2 && metro_kernel_density(&k, 0.5, 0.375) == 2, "jump");
     CHECK(metro_kernel_density(&k, 0, 0.1249) == 4 && metro_kernel_density(&k, 0, 0.1251) == 0, "sides");
     CHECK(metro_kernel_density(&k, 0.9375, 0.0625) == 2, "jump across the seam");
@@ -334,7 +325,7 @@ static void density_jumps(void)
     CHECK(metro_kernel_reflect_density(&k, 0.5, 0.625) == 2, "jump on the interval");
     CHECK(metro_kernel_reflect_density(&k, -0.5, 2.375) == metro_kernel_reflect_density(&k, 0.5, 0.375),
           "points are folded");
-    k = kernel_make(METRO_KELEMEN, 0.125, 0.25, 0);
+    k = kernel_make(METRO_KELEMEN, 0.25, 0.125, 0);
     CHECK_NEAR(metro_kernel_density(&k, 0, 0.125), 0.5 * 4 / log(2.0), 1e-15);
     CHECK_NEAR(metro_kernel_density(&k, 0.5, 0.25), 0.5 * 2 / log(2.0), 1e-15);
     k.size = 0.125;
@@ -459,13 +450,13 @@ static void draws(void)
         if (k.shape != METRO_VON_MISES) draw_against_density(k, 0.02, 1, stream++);
     }
     /* the extremes of the von Mises rejection, and steps of astronomically many turns */
-    draw_against_density(kernel_make(METRO_VON_MISES, 0, 1e-8, 0), 0.5, 0, stream++);
-    draw_against_density(kernel_make(METRO_VON_MISES, 0, 1e-300, 0), 0.5, 0, stream++);
-    draw_against_density(kernel_make(METRO_UNIFORM, 0, 1e5, 0), 0.5, 0, stream++);
-    draw_against_density(kernel_make(METRO_UNIFORM, 0, 1.6e308, 0), 0.5, 0, stream++);
-    draw_against_density(kernel_make(METRO_GAUSSIAN, 0, 1e300, 0), 0.5, 1, stream++);
-    draw_against_density(kernel_make(METRO_CAUCHY, 0, 1e308, 0), 0.5, 0, stream++);
-    draw_against_density(kernel_make(METRO_KELEMEN, 1e-3, 1e18, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_VON_MISES, 1e-8, 0, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_VON_MISES, 1e-300, 0, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_UNIFORM, 1e5, 0, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_UNIFORM, 1.6e308, 0, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_GAUSSIAN, 1e300, 0, 0), 0.5, 1, stream++);
+    draw_against_density(kernel_make(METRO_CAUCHY, 1e308, 0, 0), 0.5, 0, stream++);
+    draw_against_density(kernel_make(METRO_KELEMEN, 1e18, 1e-3, 0), 0.5, 0, stream++);
 }
 
 /* The mean of cos(2 pi h step) is the coefficient: it sees the whole law at once, for sizes that no cell resolves. */
@@ -484,21 +475,21 @@ static void draw_against_spectrum(metro_kernel k, long h, uint64_t stream)
 static void draws_narrow(void)
 {
     /* one of the coefficients away from 0 and 1 for each kernel */
-    draw_against_spectrum(kernel_make(METRO_VON_MISES, 0, 1e8, 0), 10000, 0);
-    draw_against_spectrum(kernel_make(METRO_VON_MISES, 0, 1e10, 0), 100000, 1);
-    draw_against_spectrum(kernel_make(METRO_UNIFORM, 0, 1e-6, 0), 600000, 2);
-    draw_against_spectrum(kernel_make(METRO_TRIANGLE, 0, 1e-6, 0), 800000, 3);
-    draw_against_spectrum(kernel_make(METRO_GAUSSIAN, 0, 1e-6, 0), 200000, 4);
-    draw_against_spectrum(kernel_make(METRO_CAUCHY, 0, 1e-6, 0), 100000, 5);
-    draw_against_spectrum(kernel_make(METRO_KELEMEN, 1e-9, 1e-4, 0), 10000, 6);
-    draw_against_spectrum(kernel_make(METRO_GAUSSIAN, 0, 1e-6, 0.2), 200000, 7);
-    draw_against_spectrum(kernel_make(METRO_KELEMEN, 0.1, 0.1000001, 0.3), 4, 8);
+    draw_against_spectrum(kernel_make(METRO_VON_MISES, 1e8, 0, 0), 10000, 0);
+    draw_against_spectrum(kernel_make(METRO_VON_MISES, 1e10, 0, 0), 100000, 1);
+    draw_against_spectrum(kernel_make(METRO_UNIFORM, 1e-6, 0, 0), 600000, 2);
+    draw_against_spectrum(kernel_make(METRO_TRIANGLE, 1e-6, 0, 0), 800000, 3);
+    draw_against_spectrum(kernel_make(METRO_GAUSSIAN, 1e-6, 0, 0), 200000, 4);
+    draw_against_spectrum(kernel_make(METRO_CAUCHY, 1e-6, 0, 0), 100000, 5);
+    draw_against_spectrum(kernel_make(METRO_KELEMEN, 1e-4, 1e-9, 0), 10000, 6);
+    draw_against_spectrum(kernel_make(METRO_GAUSSIAN, 1e-6, 0, 0.2), 200000, 7);
+    draw_against_spectrum(kernel_make(METRO_KELEMEN, 0.1000001, 0.1, 0.3), 4, 8);
 }
 
 /* The uniform kernel is the loop anyone would write, bit for bit, and takes one random number a step. */
 static void uniform_by_hand(void)
 {
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 0.37, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 0.37, 0, 0);
     metro_rng one = metro_rng_make(34, 0), two = one;
     double x = 0.2, y = 0.2;
     int i;
@@ -534,7 +525,7 @@ static void borders(void)
     }
     {
         /* any finite point is taken modulo 1, or folded */
-        metro_kernel k = kernel_make(METRO_GAUSSIAN, 0, 1e-9, 0);
+        metro_kernel k = kernel_make(METRO_GAUSSIAN, 1e-9, 0, 0);
         CHECK_CLOSE(metro_kernel_perturb(&k, 7.25, &rng), 0.25, 1e-7);
         CHECK_CLOSE(metro_kernel_perturb(&k, -0.25, &rng), 0.75, 1e-7);
         CHECK_CLOSE(metro_kernel_reflect_perturb(&k, 1.25, &rng), 0.75, 1e-7);
@@ -700,23 +691,23 @@ static void nonsense(void)
     for (s = 0; s < 6; s++) {
         for (i = 0; i < 4; i++) {
             if (shape_value[s] == METRO_VON_MISES && i == 3) continue;
-            check_no_kernel(kernel_make(shape_value[s], 0.1, bad[i], 0), "size");
-            check_no_kernel(kernel_make(shape_value[s], 0.1, bad[i], 0.5), "size with large steps");
+            check_no_kernel(kernel_make(shape_value[s], bad[i], 0.1, 0), "size");
+            check_no_kernel(kernel_make(shape_value[s], bad[i], 0.1, 0.5), "size with large steps");
         }
-        check_no_kernel(kernel_make(shape_value[s], 0.1, 0.2, nan), "large NaN");
-        check_no_kernel(kernel_make(shape_value[s], 0.1, 0.2, -1e-9), "large below 0");
-        check_no_kernel(kernel_make(shape_value[s], 0.1, 0.2, 1.0000001), "large above 1");
+        check_no_kernel(kernel_make(shape_value[s], 0.2, 0.1, nan), "large NaN");
+        check_no_kernel(kernel_make(shape_value[s], 0.2, 0.1, -1e-9), "large below 0");
+        check_no_kernel(kernel_make(shape_value[s], 0.2, 0.1, 1.0000001), "large above 1");
     }
-    for (i = 0; i < 4; i++) check_no_kernel(kernel_make(METRO_KELEMEN, bad[i], 0.2, 0), "smallest step");
-    check_no_kernel(kernel_make(METRO_KELEMEN, 0.3, 0.2, 0), "smallest step above the largest");
+    for (i = 0; i < 4; i++) check_no_kernel(kernel_make(METRO_KELEMEN, 0.2, bad[i], 0), "smallest step");
+    check_no_kernel(kernel_make(METRO_KELEMEN, 0.2, 0.3, 0), "smallest step above the largest");
     /* von Mises has no reflecting twin */
-    k = kernel_make(METRO_VON_MISES, 0, 3, 0);
+    k = kernel_make(METRO_VON_MISES, 3, 0, 0);
     CHECK_NAN(metro_kernel_reflect_coefficient(&k, 1));
     CHECK_NAN(metro_kernel_reflect_density(&k, 0.1, 0.2));
     CHECK_NAN(metro_kernel_reflect_perturb(&k, 0.1, &rng));
     /* points that are none */
     for (s = 0; s < 6; s++) {
-        k = kernel_make(shape_value[s], 0.1, 0.2, 0);
+        k = kernel_make(shape_value[s], 0.2, 0.1, 0);
         for (i = 0; i < 2; i++) {
             CHECK(isnan(metro_kernel_density(&k, bad[i], 0.2)) && isnan(metro_kernel_density(&k, 0.2, bad[i])),
                   "density");
@@ -754,7 +745,7 @@ static void extremes(void)
     int i, j, s;
     for (s = 0; s < 6; s++) {
         for (i = 0; i < 6; i++) {
-            metro_kernel k = kernel_make(shape_value[s], i == 3 ? 1e-30 : size[i], size[i], 0);
+            metro_kernel k = kernel_make(shape_value[s], size[i], i == 3 ? 1e-30 : size[i], 0);
             double y;
             for (j = 0; j < 6; j++) {
                 double c = metro_kernel_coefficient(&k, harmonic[j]);

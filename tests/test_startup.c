@@ -4,24 +4,10 @@
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 static const double pi = 3.14159265358979323846;
 static const double infinity = (double)INFINITY;
-
-static metro_kernel kernel_make(metro_shape shape, double size, double size_min, double large)
-{
-    metro_kernel k;
-    k.shape = shape;
-    k.size = size;
-    k.size_min = size_min;
-    k.large = large;
-    return k;
-}
-
-static metro_kernel uniform(double size)
-{
-    return kernel_make(METRO_UNIFORM, size, 0, 0);
-}
 
 /* One kernel of each shape, of moderate size, with and without large steps. */
 static metro_kernel specimen(int i)
@@ -238,7 +224,7 @@ static void seeds_row(char **field, int fields)
 {
     double seed[16], alpha[16], error, logarithm, truth = strtod(field[5], NULL), single;
     size_t seeds = list_read(field[1], seed);
-    metro_kernel k = uniform(number(field[3]));
+    metro_kernel k = uniform_kernel(number(field[3]));
     uint64_t n = strtoull(field[4], NULL, 10);
     if (check_scale() < 1 && n == 3 && k.size < 0.1) return; /* ten thousand modes */
     CHECK(fields == 7 && list_read(field[2], alpha) == seeds, "%d fields", fields);
@@ -264,7 +250,7 @@ static void axes_row(char **field, int fields)
     uint64_t n = strtoull(field[2], NULL, 10);
     double logarithm;
     CHECK(fields == 5 && axes <= 10, "%d fields", fields);
-    for (i = 0; i < axes; i++) k[i] = uniform(number(field[1]));
+    for (i = 0; i < axes; i++) k[i] = uniform_kernel(number(field[1]));
     logarithm = metro_startup_log_error_axes(k, axes, n);
     if (isinf(number(field[4]))) check_logarithm(logarithm, metro_startup_log_error(k, n) + 0.5 * log((double)axes));
     else check_error(metro_startup_error_axes(k, axes, n), logarithm, field[3], field[4]);
@@ -278,7 +264,7 @@ static void table_axes(void)
 
 static void reflect_row(char **field, int fields)
 {
-    metro_kernel k = uniform(number(field[0]));
+    metro_kernel k = uniform_kernel(number(field[0]));
     double x0 = number(field[1]);
     uint64_t n = strtoull(field[2], NULL, 10);
     CHECK(fields == 5, "%d fields", fields);
@@ -312,7 +298,7 @@ static void table_mean(void)
 
 static void distance_row(char **field, int fields)
 {
-    metro_kernel k = uniform(number(field[0]));
+    metro_kernel k = uniform_kernel(number(field[0]));
     uint64_t n = strtoull(field[1], NULL, 10);
     double variation = metro_startup_total_variation_bound(&k, n), divergence = metro_startup_divergence_bound(&k, n);
     CHECK(fields == 4, "%d fields", fields);
@@ -337,7 +323,7 @@ static void table_distances(void)
 static void evidence_for_the_errata(void)
 {
     static const double seed[3] = { 0, 0.25, 0.6 }, alpha[3] = { 0.2, 0.3, 0.5 };
-    metro_kernel k = uniform(1 / (2 * pi));
+    metro_kernel k = uniform_kernel(1 / (2 * pi));
     double printed = 0, cut = 0, p, a, b;
     int i, j;
     /* (12) on the circle of length 2 pi: B_6(0) = 11/20 is the true mean square of p_3 there */
@@ -345,7 +331,7 @@ static void evidence_for_the_errata(void)
     CHECK_CLOSE(sqrt(0.55 - 1 / (2 * pi)), 0.625176, 5e-7);
     CHECK_NEAR(metro_startup_error(&k, 3) / sqrt(2 * pi), sqrt(0.55 - 1 / (2 * pi)), 1e-12);
     /* (15) */
-    k = uniform(0.3);
+    k = uniform_kernel(0.3);
     for (i = 1; i < 1000; i++) {
         p = sin(pi * i * 0.3) / (pi * i * 0.3);
         a = b = 0;
@@ -358,20 +344,20 @@ static void evidence_for_the_errata(void)
     CHECK_CLOSE(sqrt(printed), 0.022252, 5e-7);
     CHECK_CLOSE(metro_startup_error_seeds(&k, 3, seed, alpha, 3), 0.202907, 5e-7);
     /* section 2.3: n = 10/Delta */
-    k = uniform(0.1);
+    k = uniform_kernel(0.1);
     CHECK_CLOSE(metro_startup_error(&k, 100), 0.27, 0.005);
-    k = uniform(0.01);
+    k = uniform_kernel(0.01);
     CHECK_CLOSE(metro_startup_error(&k, 1000), 1.45, 0.005);
-    k = uniform(0.001);
+    k = uniform_kernel(0.001);
     CHECK_CLOSE(metro_startup_error(&k, 10000), 2.96, 0.005);
     /* the series cut after 100 terms */
     for (i = 1; i <= 100; i++) {
         p = sin(pi * i * 0.01) / (pi * i * 0.01);
         cut += 2 * p * p;
     }
-    k = uniform(0.01);
+    k = uniform_kernel(0.01);
     CHECK_CLOSE(sqrt(cut) / metro_startup_error(&k, 1), 0.95, 0.005);
-    k = uniform(0.1);
+    k = uniform_kernel(0.1);
     CHECK_CLOSE(metro_startup_log_error(&k, 100000) / log(10.0), -717, 0.5);
 }
 
@@ -408,7 +394,7 @@ static void first_errors_are_closed(void)
     double s1 = 0.013, s2 = 0.2, l = log(s2 / s1), size;
     metro_kernel k;
     for (size = 1e-9; size < 0.6; size *= 7) {
-        k = uniform(size);
+        k = uniform_kernel(size);
         CHECK_NEAR(metro_startup_error(&k, 1), sqrt((1 - size) / size), 1e-12);
         CHECK_NEAR(metro_startup_error(&k, 2), sqrt((2 - 3 * size) / (3 * size)), 1e-12);
         k = kernel_make(METRO_TRIANGLE, size, 0, 0);
@@ -500,7 +486,7 @@ static void whole_sizes_are_exact(void)
     int i;
     for (size = 1; size < 2000; size = 2 * size + 1)
         for (n = 1; n < 1000000; n = 3 * n + 1) {
-            metro_kernel k = uniform(size), t = kernel_make(METRO_TRIANGLE, 2 * size, 0, 0);
+            metro_kernel k = uniform_kernel(size), t = kernel_make(METRO_TRIANGLE, 2 * size, 0, 0);
             double seed[2] = { 0.1, 0.45 };
             CHECK_NEAR(metro_startup_error(&k, n), 0.0, 0);
             CHECK_NEAR(metro_startup_log_error(&k, n), -infinity, 0);
@@ -513,7 +499,7 @@ static void whole_sizes_are_exact(void)
         }
     for (i = 1; i <= 50; i++)
         for (size = 1; size < 2000; size = 2 * size + 1) {
-            metro_kernel k = uniform(size + pow(0.5, i));
+            metro_kernel k = uniform_kernel(size + pow(0.5, i));
             g = k.size - rint(k.size);
             if (g == 0 || i == 1) continue;
             check_logarithm(metro_startup_log_error(&k, 1), log(g / k.size) + 0.5 * log((1 - g) / g));
@@ -522,7 +508,7 @@ static void whole_sizes_are_exact(void)
             if (g < 1e-6) CHECK_NEAR(2 * metro_startup_error_mean(&k, 1, 2), metro_startup_error(&k, 1), 1e-5);
         }
     for (i = 2; i <= 50; i++) {
-        metro_kernel k = uniform(3 - pow(0.5, i));
+        metro_kernel k = uniform_kernel(3 - pow(0.5, i));
         g = pow(0.5, i);
         check_logarithm(metro_startup_log_error(&k, 1), log(g / k.size) + 0.5 * log((1 - g) / g));
     }
@@ -555,7 +541,7 @@ static void tiny_sizes_are_quick(void)
     double size, n, truth;
     for (size = 1e-20; size < 1e-4; size *= 57)
         for (n = 1e4; n < 0.1 / (size * size) && n < 1e18; n *= 97) {
-            metro_kernel k = uniform(size), g = kernel_make(METRO_GAUSSIAN, size / sqrt(12.0), 0, 0);
+            metro_kernel k = uniform_kernel(size), g = kernel_make(METRO_GAUSSIAN, size / sqrt(12.0), 0, 0);
             /* central limit with its first correction, 1 - 3/(40 n) for uniform steps; the next is of order 1/n^2 */
             truth = sqrt(6 / (pi * 2 * n)) / size * (1 - 3 / (40 * n)) - 1;
             CHECK_NEAR(pow(metro_startup_error(&k, (uint64_t)n), 2), truth, 1e-8);
@@ -754,7 +740,7 @@ static void smooth_density_is_a_convolution(void)
    density that is not 0 where no step reaches. */
 static void density_at_the_edges(void)
 {
-    metro_kernel k = uniform(0.25);
+    metro_kernel k = uniform_kernel(0.25);
     double seed[2] = { 0.5, 0.125 }, weights[2] = { 1, 0 }, n;
     CHECK_NEAR(metro_startup_density(&k, 1, 0.625, seed, NULL, 1), 2.0, 0);
     CHECK_NEAR(metro_startup_density(&k, 1, 0.6249, seed, NULL, 1), 4.0, 0);
@@ -763,7 +749,7 @@ static void density_at_the_edges(void)
     CHECK_NEAR(metro_startup_density(&k, 0, -2.875, seed, NULL, 2), infinity, 0);
     CHECK_NEAR(metro_startup_density(&k, 0, 0.3, seed, NULL, 2), 0.0, 0);
     CHECK_NEAR(metro_startup_density(&k, 0, 0.125, seed, weights, 2), 0.0, 0);
-    k = uniform(0.01);
+    k = uniform_kernel(0.01);
     for (n = 2; n < 60; n++)
         CHECK_NEAR(metro_startup_density(&k, (uint64_t)n, 0.5 + 0.0050001 * n, seed, NULL, 1), 0.0, 0);
     /* the corner of B_n: ((n/2 - y)^{n-1})/(n-1)!/Delta, at y = n/2 - 1/2 */
@@ -938,14 +924,14 @@ static void axes_multiply(void)
     CHECK_NEAR(metro_startup_error_axes(k, 6, 2), sqrt(product - 1), 1e-12);
     CHECK_NEAR(metro_startup_log_error_axes(k, 6, 2), 0.5 * log(product - 1), 1e-12);
     for (i = 0; i < 600; i++) {
-        k[i] = uniform(0.001 * (1 + i % 7));
+        k[i] = uniform_kernel(0.001 * (1 + i % 7));
         e = metro_startup_error(&k[i], 1);
         sum += log1p(e * e);
     }
     CHECK_NEAR(metro_startup_log_error_axes(k, 600, 1), 0.5 * sum, 1e-12);
     CHECK_NEAR(metro_startup_error_axes(k, 600, 1), infinity, 0);
     check_logarithm(metro_startup_log_error_axes(k + 6, 1, 1000000000), metro_startup_log_error(k + 6, 1000000000));
-    k[0] = k[1] = k[2] = uniform(0.7);
+    k[0] = k[1] = k[2] = uniform_kernel(0.7);
     check_logarithm(metro_startup_log_error_axes(k, 3, 5000), metro_startup_log_error(k, 5000) + 0.5 * log(3.0));
 }
 
@@ -981,14 +967,14 @@ static void distances_bound_the_density(void)
         }
     /* small distances: beside Delta = 7, chi^2 = e, TV = e (1-e)/Delta, KL = chi^2/2 to first order */
     for (p = 0.01; p > 1e-12; p /= 4) {
-        metro_kernel k = uniform(7 + p);
+        metro_kernel k = uniform_kernel(7 + p);
         double f = k.size - 7;
         CHECK_NEAR(metro_startup_total_variation_bound(&k, 1), f * (1 - f) / k.size, 1e-12);
         CHECK_NEAR(metro_startup_divergence_bound(&k, 1), 0.5 * f * (1 - f) / (k.size * k.size), 0.06);
     }
     /* f = 1/2: KL = ((1+u) ln(1+u) + (1-u) ln(1-u))/2 with u = 1/(2 Delta), a short series */
     for (p = 5.5; p < 1e7; p = 10 * p + 0.5) {
-        metro_kernel k = uniform(p);
+        metro_kernel k = uniform_kernel(p);
         double u = 0.25 / (p * p);
         CHECK_NEAR(metro_startup_divergence_bound(&k, 1),
                    u * (1.0 / 2 + u * (1.0 / 12 + u * (1.0 / 30 + u * (1.0 / 56 + u / 90)))), 1e-12);
@@ -1059,7 +1045,7 @@ static void limits_are_exact(void)
     check_all(&k, 100, infinity, infinity);
     k.large = 1;
     check_all(&k, 100, 0, -infinity);
-    k = uniform(0.3);
+    k = uniform_kernel(0.3);
     CHECK_NAN(metro_startup_error_mean(&k, 1, 0));
     CHECK_NAN(metro_startup_log_error_mean(&k, 0, 0));
     CHECK_NAN(metro_startup_error_axes(&k, 0, 1));
@@ -1105,7 +1091,7 @@ static void weights_are_checked(void)
 {
     static const double good[3] = { 0.2, 0.3, 0.5 };
     double seed[3] = { 0.1, 0.4, 0.8 }, alpha[3], nan = (double)NAN;
-    metro_kernel k = uniform(0.2);
+    metro_kernel k = uniform_kernel(0.2);
     uint64_t n;
     int i;
     for (n = 0; n < 5; n++) {

@@ -2,51 +2,14 @@
    error of a run; the size that minimises it. Against tables, sums of the test's own, simulations, and known
    optima. */
 
-#include <stdlib.h>
+#include "memory.h"
 
-/* Allocations can be told to fail: the `test_fail_at`-th from now on, counting from 0; negative: none. */
-static long test_fail_at = -1, test_allocated = 0;
-
-static void *test_malloc(size_t size)
-{
-    void *memory;
-    if (test_fail_at == 0) return NULL;
-    if (test_fail_at > 0) test_fail_at--;
-    memory = malloc(size);
-    if (memory != NULL) test_allocated++;
-    return memory;
-}
-
-static void *test_realloc(void *memory, size_t size)
-{
-    if (memory == NULL) return test_malloc(size);
-    return test_fail_at == 0 ? NULL : realloc(memory, size);
-}
-
-static void test_free(void *memory)
-{
-    if (memory != NULL) test_allocated--;
-    free(memory);
-}
-
-#define METRO_MALLOC(size) test_malloc(size)
-#define METRO_REALLOC(pointer, size) test_realloc(pointer, size)
-#define METRO_FREE(pointer) test_free(pointer)
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "check.h"
+#include "kernels.h"
 
 #define CHECK_PI 3.14159265358979323846
-
-static metro_kernel kernel_make(metro_shape shape, double size_min, double size, double large)
-{
-    metro_kernel k;
-    k.shape = shape;
-    k.size = size;
-    k.size_min = size_min;
-    k.large = large;
-    return k;
-}
 
 /* --- The sphere ------------------------------------------------------------------------------------------------- */
 
@@ -225,7 +188,7 @@ static void check_run_error(const char *what, metro_run_error error, char **fiel
 
 static void run_row(char **field, int fields)
 {
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, atof(field[0]), 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, atof(field[0]), 0, 0);
     metro_run_error error = { -1, -1, -1 };
     double seed = atof(field[3]);
     char what[96];
@@ -244,7 +207,7 @@ static void run_kernel_row(char **field, int fields)
                                           METRO_CAUCHY,  METRO_VON_MISES, METRO_KELEMEN };
     static const double seeds[3] = { 0.1, 0.6, 0.35 }, alpha[3] = { 0.2, 0.5, 0.3 }, zero = 0, third = 0.3,
                         both[2] = { 1, 0.5 };
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 1, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 1, 0, 0);
     metro_run_error error = { -1, -1, -1 };
     uint64_t burn = (uint64_t)atol(field[4]), steps = (uint64_t)atol(field[5]);
     metro_result result = METRO_ERROR_ARGUMENT;
@@ -252,7 +215,7 @@ static void run_kernel_row(char **field, int fields)
     int i;
     CHECK(fields == 10, "%d fields", fields);
     for (i = 0; i < 6; i++)
-        if (strcmp(name[i], field[0]) == 0) k = kernel_make(shape[i], atof(field[1]), atof(field[2]), atof(field[3]));
+        if (strcmp(name[i], field[0]) == 0) k = kernel_make(shape[i], atof(field[2]), atof(field[1]), atof(field[3]));
     switch (field[6][0]) {
     case 'A':
         result = metro_startup_run_error(&k, burn, steps, table_cosine, table_sine, 3, &zero, NULL, 1, &error);
@@ -284,7 +247,7 @@ static void run_tables(void)
 static void run_simulation(void)
 {
     static const double seed[2] = { 0.2, 0.9 }, alpha[2] = { 0.7, 0.3 };
-    metro_kernel k = kernel_make(METRO_TRIANGLE, 0, 0.4, 0.05);
+    metro_kernel k = kernel_make(METRO_TRIANGLE, 0.4, 0, 0.05);
     metro_moments mean = { 0, 0, 0, 0 }, square = mean, flat = mean;
     metro_run_error error = { 0, 0, 0 };
     metro_rng rng = metro_rng_make(52, 0);
@@ -318,7 +281,7 @@ static void run_simulation(void)
 /* What must hold whatever the numbers are. */
 static void run_identities(void)
 {
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 0.2, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 0.2, 0, 0);
     double seed[1000], weight[3] = { 0.3, 0.3, 0.4 }, same[3] = { 0.3, 0.3, 0.3 }, c[2], s[2], p;
     metro_run_error one = { 0, 0, 0 }, two = one, limit = one;
     int i;
@@ -395,7 +358,7 @@ static void run_sums(void)
     int shape_index, burn, i, j, k, l;
     for (shape_index = 0; shape_index < 6; shape_index++) {
         for (burn = 0; burn < 3; burn += 2) {
-            metro_kernel kernel = kernel_make(shape[shape_index], 0.05, size[shape_index], 0.1 * burn);
+            metro_kernel kernel = kernel_make(shape[shape_index], size[shape_index], 0.05, 0.1 * burn);
             double x = 0.17, bias = 0, mse = 0;
             metro_run_error error = { 0, 0, 0 };
             /* f = sum_k f_k e^{2 pi i k x}; E f(z_i) f(z_j) = sum f_k f_l A_{k+l} P_{k+l}^i P_l^{j-i} */
@@ -484,7 +447,7 @@ static void best_sweep(void)
             for (n = 0; n < 3; n++) {
                 metro_run_error best = { 0, 0, 0 }, error = best, again = best;
                 double size = -1;
-                metro_kernel k = kernel_make(shape[s], 0, 1, 0);
+                metro_kernel k = kernel_make(shape[s], 1, 0, 0);
                 CHECK(metro_startup_best_size(shape[s], (uint64_t)n, steps[i], table_cosine, table_sine, 3, seed,
                                               NULL, (size_t)n, &size, &best) == METRO_OK,
                       "refused");
@@ -514,7 +477,7 @@ static void refused(void)
     double nan = (double)NAN, seed[2] = { 0.1, 0.2 }, bad_seed[2], bad_weight[2] = { 0.5, 0.6 },
            good[2] = { 0.5, 0.5 }, c[2] = { 1, 2 };
     double bad_c[2], size = 77;
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 0.3, 0), none = kernel_make(METRO_UNIFORM, 0, 0, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 0.3, 0, 0), none = kernel_make(METRO_UNIFORM, 0, 0, 0);
     metro_run_error error = { 7, 8, 9 };
     const metro_result argument = METRO_ERROR_ARGUMENT;
     bad_seed[0] = 0.1;
@@ -555,17 +518,16 @@ static void refused(void)
 static void memory(void)
 {
     static const double c[2] = { 1, 2 }, seed[2] = { 0.1, 0.2 };
-    metro_kernel k = kernel_make(METRO_UNIFORM, 0, 0.3, 0);
+    metro_kernel k = kernel_make(METRO_UNIFORM, 0.3, 0, 0);
     metro_run_error error = { 7, 8, 9 };
     double size = 77;
     long at;
-    test_free(test_realloc(NULL, 8)); /* the third of the family, which this chapter does not use */
     for (at = 0; at < 10; at++) {
         metro_result result;
-        test_fail_at = at;
+        allocations_left = at;
         result = metro_startup_run_error(&k, 0, 3, c, NULL, 2, seed, NULL, 2, &error);
-        test_fail_at = -1;
-        CHECK(test_allocated == 0, "%ld allocations lost", test_allocated);
+        allocations_left = -1;
+        CHECK(allocations_live == 0, "%ld allocations lost", allocations_live);
         if (result == METRO_OK) break;
         CHECK(result == METRO_ERROR_MEMORY && error.mse == 9, "result %d", (int)result);
     }
@@ -573,10 +535,10 @@ static void memory(void)
     error.mse = 9;
     for (at = 0; at < 10; at++) {
         metro_result result;
-        test_fail_at = at;
+        allocations_left = at;
         result = metro_startup_best_size(METRO_UNIFORM, 0, 3, c, NULL, 2, seed, NULL, 2, &size, &error);
-        test_fail_at = -1;
-        CHECK(test_allocated == 0, "%ld allocations lost", test_allocated);
+        allocations_left = -1;
+        CHECK(allocations_live == 0, "%ld allocations lost", allocations_live);
         if (result == METRO_OK) break;
         CHECK(result == METRO_ERROR_MEMORY && error.mse == 9 && size == 77, "result %d", (int)result);
     }
@@ -602,7 +564,7 @@ static double cone_two_steps(double half_angle)
 /* Catches: a quadrature that is too coarse near the hemisphere; a concentration of negative zero that is not zero. */
 static void wide_cones_and_negative_zero(void)
 {
-    metro_kernel k = kernel_make(METRO_VON_MISES, 0, -0.0, 0);
+    metro_kernel k = kernel_make(METRO_VON_MISES, -0.0, 0, 0);
     double angle;
     for (angle = 0.9; angle < 1.57; angle += 0.01)
         CHECK_CLOSE(metro_cone_startup_log_error(angle, 2), cone_two_steps(angle), 1e-12);
