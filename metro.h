@@ -20,6 +20,7 @@
    - METRO_STATIC: all functions are static, so that several files may carry their own copy.
    - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
    - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
+   - METRO_NO_TRACER: leaves out chapters 9 to 13, so that a lesson on the sampler compiles in a blink.
    - METRO_ASSERT(condition): what to do about a programmer's error, the start of a chain that was not made; `assert`
      otherwise.
 
@@ -63,6 +64,10 @@
        R6 The operator
        R7 Diagnostics
        R8 Pictures
+       R9 Geometry
+       R10 BVH
+       R11 Light
+       R12 Paths
        1 Ground
        1.1 Results
        1.2 Vectors
@@ -142,6 +147,51 @@
        8.4 Reading
        8.5 Writing
        8.6 The error of a picture
+       9 Geometry
+       9.1 Triangles
+       9.2 Filling a scene
+       9.3 What a scene is as a whole
+       9.4 Lines of text
+       9.5 What the reader has to say
+       9.6 Names
+       9.7 Vertices and faces
+       9.8 Polygons
+       9.9 The OBJ file
+       9.10 The MTL file
+       9.11 Finding the MTL file
+       9.12 Joining the caller's scene
+       10 BVH
+       10.1 Nodes and blocks
+       10.2 Where to cut
+       10.3 From two children to eight
+       10.4 Into memory
+       10.5 Building
+       10.6 Rays and boxes
+       10.7 Watertight triangles
+       10.8 Four and eight at once
+       10.9 The walk
+       10.10 Leaving a surface
+       11 Light
+       11.1 Surfaces
+       11.2 Lamps
+       11.3 The camera
+       12 Paths
+       12.1 Numbers
+       12.2 Walks
+       12.3 Weights
+       12.4 Going on
+       12.5 Joining
+       12.6 All ways of a path
+       12.7 A picture that grows
+       12.8 Rounds of paths
+       13 Metropolis light
+       13.1 The paper's state
+       13.2 Primary sample space
+       13.3 A pilot picture
+       13.4 Chains in rounds
+       13.5 How bright
+       13.6 One call for all methods
+       13.7 Errors that can be believed
        A Equations of the paper
        B Symbols
        C License
@@ -194,6 +244,7 @@ typedef enum {
     METRO_ERROR_DARK_SEED,     /* a seed has zero importance: the chain could not leave a state it never takes */
     METRO_ERROR_BAD_SEED,      /* a seed has negative, infinite or NaN importance */
     METRO_ERROR_NO_IMPORTANCE, /* no candidate has positive importance */
+    METRO_ERROR_NO_LIGHT,      /* nothing in the scene emits */
     METRO_ERROR_STOPPED        /* the caller's `stop` ended the run early; what was merged until then stands */
 } metro_result;
 
@@ -1032,6 +1083,312 @@ METRO_API metro_result metro_image_error(const metro_image *image, const metro_i
    sizes differ or a picture is empty or NULL, and then `relmse` is unchanged. */
 METRO_API metro_result metro_image_noise(const metro_image *reference, const metro_image *variance, double *relmse);
 
+#ifndef METRO_NO_TRACER
+
+/* # R9 Geometry
+
+   A scene is triangles, what they are made of, and perhaps a camera. Fill it by hand or from an OBJ file, build it
+   once, then ask it for hits:
+
+       metro_scene scene = { 0 };
+       metro_scene_load_obj(&scene, "room.obj", message, sizeof message);
+       metro_scene_build(&scene);
+
+   Coordinates are right-handed. A triangle (p0, p1, p2) has the normal (p1 - p0) x (p2 - p0); it reflects and emits
+   on the side that its normal points to, and its back is black. Colours are vectors too: x is red, y green, z blue.
+   Corners are rounded to float once, when they are added; areas, normals and lights are those of the rounded
+   triangles. */
+
+/* The one surface model: the BRDF is kd/pi + ks (ns + 2)/(2 pi) max(0, cos a)^ns, a the angle between the direction
+   of the light and the mirror image of the direction of the eye (Lafortune and Willems 1994); ke is the radiance it
+   emits, the same in all directions of the normal's side. */
+typedef struct {
+    metro_vec3 kd, ks;  /* kd + ks <= 1 in each colour */
+    double ns;
+    metro_vec3 ke;
+} metro_material;
+
+/* A pinhole at `eye` that looks at `look`; `up` points upwards in the picture. */
+typedef struct {
+    metro_vec3 eye, look, up;
+    double fov;  /* the full vertical field of view, in degrees */
+} metro_camera;
+
+/* A scene. Read its members, write none; { 0 } is an empty scene. */
+typedef struct metro_scene metro_scene;
+struct metro_scene {
+    float *corner;             /* [9 * triangle_count] */
+    uint32_t *material_of;     /* [triangle_count]: the number of each triangle's material */
+    metro_material *material;  /* [material_count]: materials 1, 2, ...; material 0 is kd = .5 and nothing else */
+    size_t triangle_count, triangle_room;
+    size_t material_count, material_room;
+    metro_camera camera;
+    int has_camera;            /* the file had a camera line */
+    uint32_t *light;           /* [light_count]: the triangles that emit, known after the build */
+    double *light_sum;         /* [light_count]: running sums of area times luminance of ke, the last scaled to 1 */
+    double light_power;        /* the sum of area times luminance of ke before the scaling */
+    size_t light_count;
+    void *bvh;                 /* NULL before the build */
+};
+
+/* Adds a material and gives its number, to be used by `metro_scene_add_triangle`: 1 for the first, then 2, 3, ... Its
+   parts must be finite and not negative, and kd + ks at most 1 in each colour (a rounding error of 1e-9 is let pass).
+   Returns METRO_OK, METRO_ERROR_ARGUMENT (another material, a scene that is built already, a NULL) or
+   METRO_ERROR_MEMORY; then the scene and `index` are unchanged. Cost: constant on average. */
+METRO_API metro_result metro_scene_add_material(metro_scene *scene, const metro_material *material, uint32_t *index);
+
+/* Adds the triangle with the three corners `corner`, rounded to float, made of material number `material`. Triangles
+   count from 0. One with a corner that is not finite as a float, or of no area, keeps its number and is never hit.
+   Returns METRO_OK, METRO_ERROR_ARGUMENT (no such material, a scene that is built already, a NULL) or
+   METRO_ERROR_MEMORY (or 2^32 - 1 triangles); then the scene is unchanged. Cost: constant on average, 40 bytes. */
+METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_vec3 corner[3], uint32_t material);
+
+/* Adds the faces of the OBJ file `path`, the materials that they use, from the MTL files that it names, and its
+   camera, and does not build. What the scene held before stays; the numbers of what is added follow on.
+
+   A polygon of n corners makes n - 2 triangles: a convex one, or any that can be seen whole from its first corner,
+   the fan from there; any other the ears that are cut off it in its own plane. Polygons without area, or with a
+   corner that is not finite, are kept as triangles that nothing hits. Read are `v`, `f`, `usemtl`, `mtllib`; of an
+   MTL file `newmtl`, `Kd`, `Ks`, `Ns`, `Ke` (one number for all colours, or three). What a material does not say is
+   0, except that one with neither Kd nor Ke has the Kd of material 0. The camera stands in a comment, of which the
+   last one counts:
+
+       # camera eye 0 1 4 look 0 1 0 up 0 1 0 fov 40
+
+   Returns METRO_OK, METRO_ERROR_FILE (the OBJ cannot be read), METRO_ERROR_FORMAT (a line is wrong, or there is no
+   face at all), METRO_ERROR_MEMORY or METRO_ERROR_ARGUMENT (a NULL, or a scene that is built already). Then the scene
+   is unchanged, nothing stays allocated, and `message` says what is wrong, as "FILE:LINE: what". On success it holds
+   the warnings, one a line, and each kind once, with the place where it was met first: an MTL file or a material that
+   is missing (material 0 stands in); Kd above 1 (taken as 1), Kd + Ks above 1 (Ks is taken as 1 - Kd), a negative
+   number (taken as 0); a transparency (d, Tr), texture (map_) or illumination model (illum) that would change the
+   picture, which are not read; a face of fewer than three corners (left out), a polygon that ears cannot be cut from
+   since it crosses itself, or with too many corners for that (a fan all the same), a vertex that is not finite, a
+   camera line of another form (left out). Without warnings `message` is empty. It is cut to `message_size` bytes with
+   its closing zero, and may be NULL when that is 0. Cost: linear in the size of the files; the OBJ file is held in
+   memory meanwhile. Source: Wavefront's "Object files (.obj)" and "MTL material format", and what exporters make of
+   them. */
+METRO_API metro_result metro_scene_load_obj(metro_scene *scene, const char *path, char *message, size_t message_size);
+
+/* The same from `obj_size` bytes of OBJ at `obj` and `mtl_size` bytes of MTL at `mtl`, which stand for all MTL files
+   that the OBJ names; `mtl` may be NULL with size 0. No file is opened. Places in `message` begin with "obj:" or
+   "mtl:". Costs a copy of the bytes. */
+METRO_API metro_result metro_scene_parse_obj(metro_scene *scene, const unsigned char *obj, size_t obj_size,
+                                             const unsigned char *mtl, size_t mtl_size, char *message,
+                                             size_t message_size);
+
+/* Material number `material`; 0 is always there. NULL when there is no such material. The pointer is good until the
+   next one is added. */
+METRO_API const metro_material *metro_scene_material(const metro_scene *scene, uint32_t material);
+
+/* Corner k (0, 1, 2) of triangle number `triangle`: the rounded one. NaN when there is no such corner. */
+METRO_API metro_vec3 metro_scene_corner(const metro_scene *scene, uint32_t triangle, int k);
+
+/* The unit normal of triangle number `triangle`, along (p1 - p0) x (p2 - p0); NaN when the triangle has no area, is
+   not finite or does not exist. */
+METRO_API metro_vec3 metro_scene_normal(const metro_scene *scene, uint32_t triangle);
+
+/* The area of triangle number `triangle`; NaN when it is not finite or does not exist. */
+METRO_API double metro_scene_area(const metro_scene *scene, uint32_t triangle);
+
+/* The corners `low` and `high` of the smallest box along the axes that holds all finite triangles. Returns
+   METRO_ERROR_ARGUMENT when there is none (or a NULL), and then both are unchanged. Cost: linear. */
+METRO_API metro_result metro_scene_bounds(const metro_scene *scene, metro_vec3 *low, metro_vec3 *high);
+
+/* A camera that has the whole scene in view, for scenes that bring none: it looks from +z at the middle of the box of
+   metro_scene_bounds, upright, with a field of view of 40 degrees, from where a sphere around the box just fits into
+   a picture that is not higher than wide. A closed room shows only the black backs of its walls to it. Returns
+   METRO_ERROR_ARGUMENT when no triangle is finite (or a NULL), and then `camera` is unchanged. Cost: linear. */
+METRO_API metro_result metro_scene_frame(const metro_scene *scene, metro_camera *camera);
+
+/* # R10 BVH
+
+   Build once; then any number of threads may ask, since a scene that is built is only read. A ray is origin + t
+   direction. The direction need not have length 1 and t counts in its lengths, so the ray from a to b has the
+   direction b - a and ends at t = 1. Triangles are hit from both sides. */
+
+/* Where a ray met a triangle: t in lengths of the direction, point = (1-u-v) p0 + u p1 + v p2; `triangle` counts the
+   triangles as they were added. */
+typedef struct {
+    double t, u, v;
+    uint32_t triangle;
+} metro_hit;
+
+/* Makes the scene ready for the queries below, and finds the triangles that emit; to be called once, after the last
+   triangle. A triangle that is not finite keeps its number and is never hit; a scene without triangles is built like
+   any other; one that is built already is left as it is. Returns METRO_ERROR_ARGUMENT (a NULL, 2^30 triangles or
+   more) or METRO_ERROR_MEMORY, and then the scene is as it was. Cost: n log n for n triangles; about 100 bytes a
+   triangle while it works, of which about 55 stay. */
+METRO_API metro_result metro_scene_build(metro_scene *scene);
+
+/* Gives back all memory and leaves the empty scene; the empty scene and NULL are allowed. */
+METRO_API void metro_scene_free(metro_scene *scene);
+
+/* Finds the nearest hit with t_min < t < t_max, writes it to `hit` and returns 1; or returns 0 and leaves `hit`
+   alone. Both inequalities hold for the t that is written, as doubles; either bound may be infinite, and t_min
+   negative. Of hits at the same t the triangle with the lowest number is taken. The direction may be as short as
+   1e-300 or as long as 1e300; one of length 0, and a NaN or an infinity in origin or direction, hit nothing, and
+   neither does anything before the build. Inside, numbers are floats: t, u and v carry about seven digits of the
+   distance and of the triangle. No ray from the inside of a closed mesh gets out between its triangles. The answer
+   does not depend on the instructions that the processor has, where a float is a float (not on the x87). Cost: about
+   log n. Source: Woop, Benthin and Wald 2013. */
+METRO_API int metro_scene_hit(const metro_scene *scene, metro_vec3 origin, metro_vec3 direction, double t_min,
+                              double t_max, metro_hit *hit);
+
+/* Whether there is any hit with t_min < t < t_max: 1 exactly where metro_scene_hit would return 1, but sooner. */
+METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, metro_vec3 direction, double t_min,
+                                   double t_max);
+
+/* # R11 Light
+
+   Directions point away from the surface: `in` to where light comes from, `out` to where it goes. */
+
+/* The BRDF of eq 11.1 in the colours of `material` between the unit vectors `in` and `out` at a surface of unit
+   `normal`; black when either is not above the surface. Per steradian. */
+METRO_API metro_vec3 metro_brdf(const metro_material *material, metro_vec3 normal, metro_vec3 in, metro_vec3 out);
+
+/* Draws `in` for a given `out` from the two numbers u and v of [0, 1), and returns its density per steradian (eq
+   11.2). A direction that falls below the surface is lost: the density is then 0. Cost: a square root, a sine, a
+   cosine and for the glossy part two powers. */
+METRO_API double metro_brdf_sample(const metro_material *material, metro_vec3 normal, metro_vec3 out, double u,
+                                   double v, metro_vec3 *in);
+
+/* The density with which `metro_brdf_sample` draws `in` for `out`; 0 below the surface. */
+METRO_API double metro_brdf_density(const metro_material *material, metro_vec3 normal, metro_vec3 in, metro_vec3 out);
+
+/* The unit direction of the ray through the film position (x, y) of a picture of `width` x `height` pixels: x runs
+   right from 0 to `width`, y down from 0 to `height`, and pixel (i, j) is the square i <= x < i + 1, j <= y < j + 1.
+   NaN for a camera that metro_camera_check refuses. */
+METRO_API metro_vec3 metro_camera_direction(const metro_camera *camera, size_t width, size_t height, double x,
+                                            double y);
+
+/* Where `point` appears on the film; returns 0, and leaves x and y alone, when it is not in the picture. */
+METRO_API int metro_camera_project(const metro_camera *camera, size_t width, size_t height, metro_vec3 point,
+                                   double *x, double *y);
+
+/* METRO_OK if the camera can take a picture: finite vectors, `eye` apart from `look`, `up` not along the view, 0 <
+   fov < 180; else METRO_ERROR_ARGUMENT. */
+METRO_API metro_result metro_camera_check(const metro_camera *camera);
+
+/* # R12 Paths
+
+   A picture of a scene is computed in rounds: make a render, run as many rounds as there is time for, and look at the
+   picture whenever you like. Every round adds on average one sample to each pixel.
+
+       metro_render render;
+       metro_render_options options = { 0 };
+       metro_image image;
+       metro_render_make(&scene, &scene.camera, &options, &render);
+       metro_render_run(&render, 16, NULL, NULL);
+       metro_render_image(&render, &image);
+*/
+
+#define METRO_DEPTH_MOST 32
+
+typedef enum {
+    METRO_BDPT,    /* bidirectional path tracing, walks from both sides: Lafortune and Willems (1993), Veach (1995) */
+    METRO_PATH,    /* walks from the eye, which aim at a lamp at each step */
+    METRO_LIGHT,   /* walks from the lamps, which are joined to the eye at each step */
+    METRO_MLT,     /* Metropolis sampling of bidirectional paths with the paper's angular perturbation */
+    METRO_PSSMLT   /* Metropolis sampling of the numbers from which such paths are made, Kelemen et al. (2002) */
+} metro_method;
+
+/* How the ways to make a path share it. */
+typedef enum {
+    METRO_POWER,      /* the power heuristic, eq 12.3 */
+    METRO_BALANCE,    /* the balance heuristic */
+    METRO_UNWEIGHTED  /* each way counts the whole path: pictures of single ways, which must agree */
+} metro_heuristic;
+
+/* Where the chains of a render start. */
+typedef enum {
+    METRO_START_SEEDS,    /* at one of `candidates` uniform draws, in proportion to its importance */
+    METRO_START_POINT,    /* at the first state of positive importance of stream `start_seed`: the same in each run */
+    METRO_START_WEIGHTED  /* as METRO_START_SEEDS, with Veach's weights: unbiased from the first sample */
+} metro_start;
+
+/* Zero means the default, which stands behind the colon. */
+typedef struct {
+    size_t width, height;       /* of the picture in pixels: 128 */
+    int depth;                  /* the most edges of a path, at most METRO_DEPTH_MOST: 8 */
+    int shortest;               /* the fewest edges: 1. With 2, lamps are not seen directly */
+    metro_method method;
+    metro_heuristic heuristic;
+    int one_connection;         /* METRO_BDPT: one pair of vertices is joined for each length, not all */
+    int random_numbers;         /* METRO_BDPT, _PATH, _LIGHT: independent random numbers, no even points */
+    int pyramid;                /* METRO_BDPT: keep a picture for each way of making a path */
+    uint64_t seed;
+    uint64_t part;              /* the number of this share of a larger run: shares are independent */
+    size_t threads;             /* one for each core */
+    /* for METRO_MLT and METRO_PSSMLT: */
+    size_t chains;              /* 64 */
+    metro_start start;
+    size_t candidates;          /* for each chain: 1024 */
+    uint64_t start_seed;        /* for METRO_START_POINT */
+    double perturbation;        /* METRO_MLT: the apex angle of the cone in radians, twice its half-angle: 0.3.
+                                   METRO_PSSMLT: the largest small step: 0.02 */
+    double large_step;          /* the probability of a large step: METRO_MLT none, METRO_PSSMLT 0.3; -1: none */
+    int one_direction;          /* METRO_MLT: perturb one direction of the path, not all */
+    int largest_channel;        /* importance is the largest of red, green, blue, not the luminance */
+    int all_connections;        /* METRO_PSSMLT: a state makes all ways of a path, not one */
+    int one_stage;              /* METRO_PSSMLT: importance is not divided by a pilot picture */
+} metro_render_options;
+
+typedef struct {
+    const metro_scene *scene;
+    metro_render_options options; /* with the defaults filled in */
+    uint64_t rounds;              /* done so far */
+    uint64_t samples, rays;
+    void *state;
+} metro_render;
+
+/* What a careful person asks of a picture. NaN stands for what a method does not have. */
+typedef struct {
+    double mean, mean_error;       /* the mean luminance of the picture and its standard error */
+    double b, b_error;             /* the integral of the importance, and its standard error */
+    double acceptance;             /* the share of mutations that were accepted */
+    double dark;                   /* the share of tentative states of zero importance */
+    double squared_jump;           /* the mean squared distance of a mutation that is made, 0 for one that is not */
+    uint64_t longest_stay;         /* the most mutations in a row that stayed in one state */
+    uint64_t not_finite;           /* contributions that were NaN or infinite: counted, and left out */
+    double rhat;                   /* the worst R-hat of 16 blocks of the picture, over the chains */
+    double ess;                    /* the smallest bulk ESS of these blocks */
+    double worst;                  /* the largest relative standard error of these blocks */
+    char warning[400];             /* why the picture is not to be trusted, in words; empty if nothing is known */
+} metro_render_report;
+
+/* Prepares to render `scene` as `camera` sees it; both are read during the runs and must stay. Returns
+   METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses or options out of
+   range, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `render` is then unchanged. */
+METRO_API metro_result metro_render_make(const metro_scene *scene, const metro_camera *camera,
+                                         const metro_render_options *options, metro_render *render);
+
+/* Makes `rounds` more rounds. After each, `stop` (may be NULL) is asked; nonzero ends the run with
+   METRO_ERROR_STOPPED. Returns METRO_ERROR_NO_IMPORTANCE if no chain finds a state to start from, or
+   METRO_ERROR_MEMORY; what is there so far stands. The picture depends on the options and the number of rounds, not
+   on the threads or on how the rounds were shared out over calls. */
+METRO_API metro_result metro_render_run(metro_render *render, uint64_t rounds,
+                                        int (*stop)(const metro_render *render, void *user), void *user);
+
+/* Makes `image` and fills it with the picture so far, linear radiance. Returns METRO_ERROR_MEMORY, or
+   METRO_ERROR_ARGUMENT before the first round; `image` is then unchanged. */
+METRO_API metro_result metro_render_image(const metro_render *render, metro_image *image);
+
+/* The same for the paths of s vertices from the lamp and t from the eye, where the options ask for a pyramid. */
+METRO_API metro_result metro_render_way(const metro_render *render, int s, int t, metro_image *image);
+
+/* The mean luminance of block (column, row) of 8 x 8 pixels and its standard error: from the spread over the chains,
+   or over sixteen groups of rounds. NaN where there is no such block or too little to say. */
+METRO_API double metro_render_block(const metro_render *render, size_t column, size_t row, double *error);
+
+/* Says how far the picture so far can be believed. Never fails: before the first round all is NaN or 0. Cost: some
+   milliseconds for the ranks of R-hat. */
+METRO_API void metro_render_diagnose(const metro_render *render, metro_render_report *report);
+
+/* Gives back all memory; a zeroed render is allowed. */
+METRO_API void metro_render_free(metro_render *render);
+
+#endif /* METRO_NO_TRACER */
+
 #ifdef __cplusplus
 }
 #endif
@@ -1090,6 +1447,8 @@ METRO_API const char *metro_result_text(metro_result result)
         return "the importance of a seed is negative, infinite or NaN; check the importance function";
     case METRO_ERROR_NO_IMPORTANCE:
         return "no candidate has positive importance; try more candidates or check the importance function";
+    case METRO_ERROR_NO_LIGHT:
+        return "the scene has no lamp; give a material of its MTL file an emission, as in: Ke 10 10 10";
     case METRO_ERROR_STOPPED: return "the run was stopped early; the result so far stands";
     }
     return "unknown result";
@@ -3917,7 +4276,7 @@ static double metroi_far_coefficient(const metroi_far *far, double j)
     size_t n, at = 0, turn;
     if (far->binomial) return far->value[0][0];
     if (2 * fabs(j) >= (double)far->samples) return 0;
-    turn = (size_t)fabs(j) * (METROI_FAR_SAMPLES / far->samples);
+    turn = (size_t)(j < 0 ? -j : j) * (METROI_FAR_SAMPLES / far->samples);
     for (n = 0; 4 * n <= far->samples; n++) {
         sum += value[n] * far->cosine[at];
         at += turn;
@@ -8671,10 +9030,5095 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
     return METRO_OK;
 }
 
+#ifndef METRO_NO_TRACER
+
+/* # 9 Geometry
+
+   Triangles only: whatever is curved or has many corners can be cut into them, and one kind of surface needs one kind
+   of care. This chapter holds them, says what their normals and areas are, and reads them from the files that
+   modelling programs write. */
+
+/* # 9.1 Triangles
+
+   A corner is three floats. Rounding it once, when it is added, and taking everything from the rounded numbers means
+   that the ray tracer, the lamps and the normals all speak of the same triangle: no light leaks where two of them
+   would disagree by a digit. What is computed from the corners is computed in double. The product of two edges has at
+   most twice the digits of a float and a size between 1e-90 and 1e78, so its square neither overflows nor vanishes,
+   and no scaling is needed.
+
+   These small functions are asked at every hit, so they are compiled as fast as the rest of the program. */
+
+#ifdef METROI_COMPILE_FAST
+#pragma GCC pop_options
+#endif
+
+static metro_vec3 metroi_triangle_corner(const metro_scene *scene, uint32_t triangle, int k)
+{
+    const float *corner = scene->corner + 9 * (size_t)triangle + 3 * (size_t)k;
+    return metro_vec3_make((double)corner[0], (double)corner[1], (double)corner[2]);
+}
+
+static void metroi_triangle_corners(const metro_scene *scene, uint32_t triangle, metro_vec3 p[3])
+{
+    int k;
+    for (k = 0; k < 3; k++) p[k] = metroi_triangle_corner(scene, triangle, k);
+}
+
+/* The product of the edges: it stands on the triangle, and its length is twice the area,
+
+       n = frac{e_1 "x" e_2}{abs(e_1 "x" e_2)},   A = frac{1}{2} abs(e_1 "x" e_2)            (9.1)
+
+   where e_1 = p_1 - p_0 and e_2 = p_2 - p_0. */
+
+static metro_vec3 metroi_triangle_cross(const metro_scene *scene, uint32_t triangle)
+{
+    metro_vec3 p[3];
+    metroi_triangle_corners(scene, triangle, p);
+    return metro_cross(metro_subtract(p[1], p[0]), metro_subtract(p[2], p[0]));
+}
+
+static metro_vec3 metroi_triangle_normal(const metro_scene *scene, uint32_t triangle)
+{
+    metro_vec3 cross = metroi_triangle_cross(scene, triangle);
+    return metro_scale(cross, 1.0 / sqrt(metro_dot(cross, cross))); /* eq 9.1; 0 times infinity is NaN */
+}
+
+static double metroi_triangle_area(const metro_scene *scene, uint32_t triangle)
+{
+    metro_vec3 cross = metroi_triangle_cross(scene, triangle);
+    return 0.5 * sqrt(metro_dot(cross, cross)); /* eq 9.1 */
+}
+
+/* Material 0 is always there and stands in no list. */
+
+static const metro_material *metroi_scene_material(const metro_scene *scene, uint32_t material)
+{
+    static const metro_material plain = { { 0.5, 0.5, 0.5 }, { 0, 0, 0 }, 0, { 0, 0, 0 } };
+    return material == 0 ? &plain : &scene->material[material - 1];
+}
+
+#ifdef METROI_COMPILE_FAST
+#pragma GCC push_options
+#pragma GCC optimize("O1")
+#endif
+
+/* The faces that these show to a user know the borders of their lists. */
+
+METRO_API const metro_material *metro_scene_material(const metro_scene *scene, uint32_t material)
+{
+    if (scene == NULL || material > scene->material_count) return NULL;
+    return metroi_scene_material(scene, material);
+}
+
+METRO_API metro_vec3 metro_scene_corner(const metro_scene *scene, uint32_t triangle, int k)
+{
+    if (scene == NULL || triangle >= scene->triangle_count || k < 0 || k > 2)
+        return metro_vec3_make(METROI_NAN, METROI_NAN, METROI_NAN);
+    return metroi_triangle_corner(scene, triangle, k);
+}
+
+static int metroi_triangle_is_finite(const metro_scene *scene, uint32_t triangle)
+{
+    const float *corner = scene->corner + 9 * (size_t)triangle;
+    int i;
+    for (i = 0; i < 9; i++)
+        if (!isfinite(corner[i])) return 0;
+    return 1;
+}
+
+METRO_API metro_vec3 metro_scene_normal(const metro_scene *scene, uint32_t triangle)
+{
+    if (scene == NULL || triangle >= scene->triangle_count || !metroi_triangle_is_finite(scene, triangle))
+        return metro_vec3_make(METROI_NAN, METROI_NAN, METROI_NAN);
+    return metroi_triangle_normal(scene, triangle);
+}
+
+METRO_API double metro_scene_area(const metro_scene *scene, uint32_t triangle)
+{
+    if (scene == NULL || triangle >= scene->triangle_count || !metroi_triangle_is_finite(scene, triangle))
+        return METROI_NAN;
+    return metroi_triangle_area(scene, triangle);
+}
+
+/* # 9.2 Filling a scene
+
+   Lists grow by half of their size, so that adding an item costs the same on average however many there are. The new
+   size is checked before it is multiplied out. */
+
+static void *metroi_grown(void *block, size_t *room, size_t need, size_t item)
+{
+    size_t wanted = *room + *room / 2, bytes;
+    void *grown;
+    if (wanted < need) wanted = need;
+    if (wanted < 16) wanted = 16;
+    if (!metroi_size_multiply(wanted, item, &bytes)) return NULL;
+    grown = block == NULL ? METRO_MALLOC(bytes) : METRO_REALLOC(block, bytes);
+    if (grown != NULL) *room = wanted;
+    return grown;
+}
+
+/* Makes room for `more` triangles. The two lists share one count of their room: where the second one fails, the first
+   is longer than it says, which harms nobody. */
+
+static metro_result metroi_scene_grow(metro_scene *scene, size_t more)
+{
+    const size_t most = 0xffffffffu; /* numbers of triangles have 32 bits, and the last one is left free */
+    size_t need = scene->triangle_count + more, room;
+    void *grown;
+    if (more > most || need > most) return METRO_ERROR_MEMORY;
+    if (need <= scene->triangle_room) return METRO_OK;
+    room = scene->triangle_room;
+    grown = metroi_grown(scene->corner, &room, need, 9 * sizeof *scene->corner);
+    if (grown == NULL) return METRO_ERROR_MEMORY;
+    scene->corner = (float *)grown;
+    room = scene->triangle_room;
+    grown = metroi_grown(scene->material_of, &room, need, sizeof *scene->material_of);
+    if (grown == NULL) return METRO_ERROR_MEMORY;
+    scene->material_of = (uint32_t *)grown;
+    scene->triangle_room = room;
+    return METRO_OK;
+}
+
+/* A double beyond the range of float has no defined conversion. */
+
+static float metroi_float(double value)
+{
+    const double largest = 3.4028234663852886e38; /* (2 - 2^-23) 2^127 */
+    if (value > largest) return (float)INFINITY;
+    return value < -largest ? -(float)INFINITY : (float)value;
+}
+
+METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_vec3 corner[3], uint32_t material)
+{
+    metro_result result;
+    float *place;
+    size_t k;
+    if (scene == NULL || corner == NULL || scene->bvh != NULL || material > scene->material_count)
+        return METRO_ERROR_ARGUMENT;
+    result = metroi_scene_grow(scene, 1);
+    if (result != METRO_OK) return result;
+    place = scene->corner + 9 * scene->triangle_count;
+    for (k = 0; k < 3; k++) {
+        place[3 * k] = metroi_float(corner[k].x);
+        place[3 * k + 1] = metroi_float(corner[k].y);
+        place[3 * k + 2] = metroi_float(corner[k].z);
+    }
+    scene->material_of[scene->triangle_count++] = material;
+    return METRO_OK;
+}
+
+/* A material must not send out more than it receives, in any colour, or light would grow with every reflection. The
+   comparisons are turned so that NaN fails them. */
+
+static int metroi_color_is_good(metro_vec3 color)
+{
+    return color.x >= 0 && color.y >= 0 && color.z >= 0 && isfinite(color.x) && isfinite(color.y)
+        && isfinite(color.z);
+}
+
+static int metroi_material_is_good(const metro_material *material)
+{
+    const double most = 1 + 1e-9;
+    metro_vec3 sum = metro_add(material->kd, material->ks);
+    return metroi_color_is_good(material->kd) && metroi_color_is_good(material->ks)
+        && metroi_color_is_good(material->ke) && sum.x <= most && sum.y <= most && sum.z <= most
+        && material->ns >= 0 && isfinite(material->ns);
+}
+
+METRO_API metro_result metro_scene_add_material(metro_scene *scene, const metro_material *material, uint32_t *index)
+{
+    if (scene == NULL || material == NULL || index == NULL || scene->bvh != NULL) return METRO_ERROR_ARGUMENT;
+    if (!metroi_material_is_good(material)) return METRO_ERROR_ARGUMENT;
+    if (scene->material_count >= 0xfffffffeu) return METRO_ERROR_MEMORY;
+    if (scene->material_count == scene->material_room) {
+        size_t need = scene->material_count + 1;
+        void *grown = metroi_grown(scene->material, &scene->material_room, need, sizeof *material);
+        if (grown == NULL) return METRO_ERROR_MEMORY;
+        scene->material = (metro_material *)grown;
+    }
+    scene->material[scene->material_count++] = *material;
+    *index = (uint32_t)scene->material_count;
+    return METRO_OK;
+}
+
+/* # 9.3 What a scene is as a whole
+
+   Its box, over the triangles that can be hit. */
+
+METRO_API metro_result metro_scene_bounds(const metro_scene *scene, metro_vec3 *low, metro_vec3 *high)
+{
+    float least[3], most[3];
+    size_t i, k, found = 0;
+    if (scene == NULL || low == NULL || high == NULL) return METRO_ERROR_ARGUMENT;
+    for (k = 0; k < 3; k++) {
+        least[k] = (float)INFINITY;
+        most[k] = -(float)INFINITY;
+    }
+    for (i = 0; i < scene->triangle_count; i++) {
+        const float *corner = scene->corner + 9 * i;
+        if (!metroi_triangle_is_finite(scene, (uint32_t)i)) continue;
+        for (k = 0; k < 9; k++) {
+            if (corner[k] < least[k % 3]) least[k % 3] = corner[k];
+            if (corner[k] > most[k % 3]) most[k % 3] = corner[k];
+        }
+        found++;
+    }
+    if (found == 0) return METRO_ERROR_ARGUMENT;
+    *low = metro_vec3_make((double)least[0], (double)least[1], (double)least[2]);
+    *high = metro_vec3_make((double)most[0], (double)most[1], (double)most[2]);
+    return METRO_OK;
+}
+
+/* A sphere of radius r is just inside a cone of half the angle fov/2 from the distance
+
+       d = frac{r}{sin("fov"/2)}                                                      (9.2)
+
+   and the field of view is that cone at its narrowest. A scene that is a single point is given a radius of 1. */
+
+METRO_API metro_result metro_scene_frame(const metro_scene *scene, metro_camera *camera)
+{
+    const double fov = 40;
+    metro_vec3 low, high, middle;
+    double radius;
+    if (camera == NULL || metro_scene_bounds(scene, &low, &high) != METRO_OK) return METRO_ERROR_ARGUMENT;
+    middle = metro_scale(metro_add(low, high), 0.5);
+    radius = 0.5 * metro_length(metro_subtract(high, low));
+    if (!(radius > 0)) radius = 1;
+    camera->look = middle;
+    camera->eye = metro_add(middle, metro_vec3_make(0, 0, radius / sin(fov * METROI_PI / 360))); /* eq 9.2 */
+    camera->up = metro_vec3_make(0, 1, 0);
+    camera->fov = fov;
+    return METRO_OK;
+}
+
+/* The lamps are the triangles that emit and have an area. A lamp is chosen with a probability proportional to its
+   area times the luminance of its emission; for that we keep running sums, scaled so that the last one is 1, and look
+   up a uniform number among them. The sum before the scaling, times pi, is the luminous power of the scene. */
+
+static double metroi_triangle_power(const metro_scene *scene, size_t triangle)
+{
+    metro_vec3 ke = metroi_scene_material(scene, scene->material_of[triangle])->ke;
+    double luminance = metro_luminance(ke.x, ke.y, ke.z), area;
+    if (!(luminance > 0)) return 0;
+    area = metroi_triangle_area(scene, (uint32_t)triangle);
+    return area > 0 && isfinite(area) ? area * luminance : 0;
+}
+
+static void metroi_scene_lights_forget(metro_scene *scene)
+{
+    METRO_FREE(scene->light);
+    METRO_FREE(scene->light_sum);
+    scene->light = NULL;
+    scene->light_sum = NULL;
+    scene->light_count = 0;
+    scene->light_power = 0;
+}
+
+/* Lists the lamps. METRO_ERROR_ARGUMENT when their power is too large for a number; on failure there are none. */
+
+static metro_result metroi_scene_lights(metro_scene *scene)
+{
+    metro_sum sum = { 0, 0 };
+    size_t i, count = 0;
+    metroi_scene_lights_forget(scene);
+    for (i = 0; i < scene->triangle_count; i++) count += metroi_triangle_power(scene, i) > 0;
+    if (count == 0) return METRO_OK;
+    /* Fewer than 2^32 items of 8 bytes: on a machine whose sizes have 32 bits the triangles would not have fitted. */
+    scene->light = (uint32_t *)METRO_MALLOC(count * sizeof *scene->light);
+    scene->light_sum = (double *)METRO_MALLOC(count * sizeof *scene->light_sum);
+    if (scene->light == NULL || scene->light_sum == NULL) {
+        metroi_scene_lights_forget(scene);
+        return METRO_ERROR_MEMORY;
+    }
+    for (i = 0; i < scene->triangle_count; i++) {
+        double power = metroi_triangle_power(scene, i);
+        if (!(power > 0)) continue;
+        metro_sum_add(&sum, power);
+        scene->light[scene->light_count] = (uint32_t)i;
+        scene->light_sum[scene->light_count++] = metro_sum_value(&sum);
+    }
+    scene->light_power = metro_sum_value(&sum);
+    if (!isfinite(scene->light_power)) {
+        metroi_scene_lights_forget(scene);
+        return METRO_ERROR_ARGUMENT;
+    }
+    for (i = 0; i < count; i++) scene->light_sum[i] /= scene->light_power;
+    return METRO_OK;
+}
+
+/* # 9.4 Lines of text
+
+   An OBJ file is lines, and so is an MTL file. Each begins with a keyword, and may go on below when its last byte is
+   a backslash. Files come with the line ends of Unix, of Windows, and from old machines with carriage returns alone;
+   some begin with the three bytes that mark UTF-8. We even all this out before anything else, in place: the end of a
+   line is a line feed, a line that goes on has a vertical tab where it was broken (white space that still counts as a
+   line), and everything else stays where it was. A comment does not go on: `# C:\models\` is the end of more than one
+   of them. */
+
+typedef struct {
+    const char *file;      /* for messages */
+    metroi_text text;      /* the whole file */
+    metroi_text line;      /* the current line, without its end */
+    size_t number, joined; /* the number of its first line, and how many it takes */
+    int are_joined;        /* some lines go on below */
+} metroi_lines;
+
+/* Is the place `at` in a line that begins with `#`? Each line is looked back into at most once, from its end. */
+static int metroi_in_comment(const unsigned char *bytes, size_t at)
+{
+    while (at > 0 && bytes[at - 1] != '\n' && bytes[at - 1] != '\v') at--;
+    while (bytes[at] == ' ' || bytes[at] == '\t') at++;
+    return bytes[at] == '#';
+}
+
+/* Returns whether a line goes on below. */
+static int metroi_lines_even(unsigned char *bytes, size_t size)
+{
+    size_t i, end;
+    int joined = 0;
+    if (size > 0 && memchr(bytes, '\n', size) == NULL)
+        for (i = 0; i < size; i++)
+            if (bytes[i] == '\r') bytes[i] = '\n';
+    if (size >= 3 && memcmp(bytes, "\xef\xbb\xbf", 3) == 0) memset(bytes, ' ', 3);
+    for (i = 0; i < size; i++) {
+        const void *found = memchr(bytes + i, '\\', size - i);
+        if (found == NULL) return joined;
+        i = (size_t)((const unsigned char *)found - bytes);
+        end = i + 1;
+        if (end < size && bytes[end] == '\r') end++;
+        if (end == size || bytes[end] != '\n' || metroi_in_comment(bytes, i)) continue;
+        memset(bytes + i, ' ', end - i);
+        bytes[end] = '\v';
+        joined = 1;
+    }
+    return joined;
+}
+
+static metroi_lines metroi_lines_make(const char *file, unsigned char *bytes, size_t size)
+{
+    metroi_lines lines;
+    memset(&lines, 0, sizeof lines);
+    lines.are_joined = metroi_lines_even(bytes, size);
+    lines.file = file;
+    lines.text.bytes = bytes;
+    lines.text.size = size;
+    lines.joined = 1;
+    return lines;
+}
+
+/* Goes on to the next line, with the place at its first byte that is not blank; 0 at the end of the file. */
+static int metroi_lines_next(metroi_lines *lines)
+{
+    metroi_text *text = &lines->text, *line = &lines->line;
+    const void *end;
+    size_t i;
+    if (text->at >= text->size) return 0;
+    line->bytes = text->bytes + text->at;
+    end = memchr(line->bytes, '\n', text->size - text->at);
+    line->size = end != NULL ? (size_t)((const unsigned char *)end - line->bytes) : text->size - text->at;
+    line->at = 0;
+    text->at += line->size + 1;
+    lines->number += lines->joined;
+    lines->joined = 1;
+    for (i = 0; lines->are_joined && i < line->size; i++) lines->joined += line->bytes[i] == '\v';
+    while (metroi_is_blank(metroi_text_peek(line))) line->at++;
+    return 1;
+}
+
+/* Is `word` the next word of the line? If so the place moves behind it. */
+static int metroi_line_word(metroi_text *line, const char *word)
+{
+    size_t length = strlen(word), end = line->at + length;
+    if (line->size - line->at < length || memcmp(line->bytes + line->at, word, length) != 0) return 0;
+    if (end < line->size && !metroi_is_blank(line->bytes[end])) return 0;
+    line->at = end;
+    while (metroi_is_blank(metroi_text_peek(line))) line->at++;
+    return 1;
+}
+
+/* # 9.5 What the reader has to say
+
+   An error ends the reading and takes the message for itself. A warning joins those before it, once a kind. Every one
+   begins with the file and the line. */
+
+enum {
+    METROI_WARN_LIBRARY,
+    METROI_WARN_NAME,
+    METROI_WARN_BRIGHT,
+    METROI_WARN_GLOSSY,
+    METROI_WARN_NEGATIVE,
+    METROI_WARN_CLEAR,
+    METROI_WARN_TEXTURE,
+    METROI_WARN_ILLUM,
+    METROI_WARN_CORNERS,
+    METROI_WARN_CROSSED,
+    METROI_WARN_INFINITE,
+    METROI_WARN_CAMERA
+};
+
+typedef struct {
+    const unsigned char *text;
+    size_t length;
+} metroi_slice;
+
+typedef struct {
+    char *message;
+    size_t size, at;
+    unsigned long told; /* one bit a kind */
+} metroi_notes;
+
+static void metroi_notes_add(metroi_notes *notes, const char *part)
+{
+    if (notes->message != NULL && notes->size > 0)
+        notes->at = metroi_tell_part(notes->message, notes->size, notes->at, part);
+}
+
+static void metroi_notes_slice(metroi_notes *notes, metroi_slice slice)
+{
+    size_t i;
+    char part[2] = { 0, 0 };
+    for (i = 0; i < slice.length && notes->at + 1 < notes->size; i++) {
+        part[0] = (char)slice.text[i];
+        if (part[0] != 0) metroi_notes_add(notes, part);
+    }
+}
+
+static void metroi_notes_number(metroi_notes *notes, size_t number)
+{
+    char digits[24];
+    size_t at = sizeof digits - 1;
+    digits[at] = 0;
+    do digits[--at] = (char)('0' + number % 10);
+    while ((number /= 10) > 0);
+    metroi_notes_add(notes, digits + at);
+}
+
+static void metroi_notes_place(metroi_notes *notes, const char *file, size_t line)
+{
+    metroi_notes_add(notes, file);
+    metroi_notes_add(notes, ":");
+    metroi_notes_number(notes, line);
+    metroi_notes_add(notes, ": ");
+}
+
+/* Is this the first warning of its kind? Then its place is written, and the caller goes on with what is wrong. */
+static int metroi_notes_warn(metroi_notes *notes, int kind, const char *file, size_t line)
+{
+    if ((notes->told >> kind & 1) != 0) return 0;
+    notes->told |= 1ul << kind;
+    if (notes->at > 0) metroi_notes_add(notes, "\n");
+    metroi_notes_place(notes, file, line);
+    return 1;
+}
+
+/* An error: forgets the warnings. */
+static metro_result metroi_notes_refuse(metroi_notes *notes, const metroi_lines *lines, const char *why)
+{
+    notes->at = 0;
+    metroi_notes_place(notes, lines->file, lines->number);
+    metroi_notes_add(notes, why);
+    return METRO_ERROR_FORMAT;
+}
+
+static metro_result metroi_notes_memory(metroi_notes *notes, const char *file)
+{
+    notes->at = 0;
+    metroi_notes_add(notes, file);
+    metroi_notes_add(notes, ": there is not enough memory for the scene");
+    return METRO_ERROR_MEMORY;
+}
+
+/* # 9.6 Names
+
+   A file may name a hundred thousand materials, and each `usemtl` looks one up. The names wait in a list, in the
+   order they were met, and a table of slots finds them: a name starts looking at the slot that a hash of its bytes
+   says, and takes the first free one after it. At most half of the slots are taken. The hash mixes every byte in
+   thoroughly, so that names which count up do not crowd together. */
+
+typedef struct {
+    metroi_slice slice;
+    size_t line;       /* where it was met first */
+    uint32_t material; /* the number in the scene; 0 until it is defined */
+    int is_defined;
+} metroi_name;
+
+typedef struct {
+    metroi_name *name;
+    size_t count, room;
+    size_t *slot; /* [slots]: 1 + the number of a name, 0 where free; slots is a power of two */
+    size_t slots;
+} metroi_names;
+
+static void metroi_names_free(metroi_names *names)
+{
+    METRO_FREE(names->name);
+    METRO_FREE(names->slot);
+}
+
+static uint64_t metroi_slice_hash(metroi_slice slice)
+{
+    uint64_t hash = slice.length;
+    size_t i;
+    for (i = 0; i < slice.length; i++) hash = metroi_mix(hash + slice.text[i] + UINT64_C(0x9e3779b97f4a7c15));
+    return hash;
+}
+
+/* The slot where `slice` stands, or the free one where it would. There must be slots. */
+static size_t metroi_names_slot(const metroi_names *names, metroi_slice slice)
+{
+    size_t at = (size_t)metroi_slice_hash(slice) & (names->slots - 1);
+    for (; names->slot[at] != 0; at = (at + 1) & (names->slots - 1)) {
+        metroi_slice other = names->name[names->slot[at] - 1].slice;
+        if (other.length == slice.length && memcmp(other.text, slice.text, slice.length) == 0) break;
+    }
+    return at;
+}
+
+/* The name `slice`, or NULL. */
+static metroi_name *metroi_names_find(const metroi_names *names, metroi_slice slice)
+{
+    size_t at;
+    if (names->slots == 0) return NULL;
+    at = names->slot[metroi_names_slot(names, slice)];
+    return at != 0 ? &names->name[at - 1] : NULL;
+}
+
+/* Doubles the slots and puts every name into its new one. */
+static int metroi_names_widen(metroi_names *names)
+{
+    size_t slots = names->slots > 0 ? 2 * names->slots : 32, bytes, i;
+    size_t *slot;
+    if (!metroi_size_multiply(slots, sizeof *slot, &bytes)) return 0;
+    slot = (size_t *)METRO_MALLOC(bytes);
+    if (slot == NULL) return 0;
+    memset(slot, 0, bytes);
+    METRO_FREE(names->slot);
+    names->slot = slot;
+    names->slots = slots;
+    for (i = 0; i < names->count; i++) slot[metroi_names_slot(names, names->name[i].slice)] = i + 1;
+    return 1;
+}
+
+/* Adds `slice` unless it is there. Returns 1 + its number, or 0 when there is no memory. The bytes are not copied. */
+static size_t metroi_names_add(metroi_names *names, metroi_slice slice, size_t line)
+{
+    metroi_name *name;
+    size_t at;
+    if (2 * (names->count + 1) > names->slots && !metroi_names_widen(names)) return 0;
+    at = metroi_names_slot(names, slice);
+    if (names->slot[at] != 0) return names->slot[at];
+    if (names->count == names->room) {
+        void *grown = metroi_grown(names->name, &names->room, names->count + 1, sizeof *name);
+        if (grown == NULL) return 0;
+        names->name = (metroi_name *)grown;
+    }
+    name = &names->name[names->count++];
+    memset(name, 0, sizeof *name);
+    name->slice = slice;
+    name->line = line;
+    names->slot[at] = names->count;
+    return names->count;
+}
+
+/* A name is the rest of its line without the blanks around it, since names have blanks in them, and even `#`. Only a
+   `#` that stands alone begins a comment. */
+static metroi_slice metroi_line_rest(const metroi_text *line)
+{
+    metroi_slice rest;
+    size_t end = line->at;
+    while (end < line->size) {
+        int stands_alone = line->bytes[end] == '#' && end > 0 && metroi_is_blank(line->bytes[end - 1])
+            && (end + 1 == line->size || metroi_is_blank(line->bytes[end + 1]));
+        if (stands_alone) break;
+        end++;
+    }
+    while (end > line->at && metroi_is_blank(line->bytes[end - 1])) end--;
+    rest.text = line->bytes + line->at;
+    rest.length = end - line->at;
+    return rest;
+}
+
+/* # 9.7 Vertices and faces
+
+   The reader collects what it finds in a scene of its own, which joins the caller's at the end, so that a file that
+   turns out bad leaves no trace. While it reads, the material of a triangle is the number of a name: the MTL file may
+   be named later, and most of its materials may never be used. */
+
+typedef struct {
+    metro_scene part;
+    metroi_notes notes;
+    metroi_lines lines;
+    float *vertex; /* [3 * vertices] */
+    size_t vertices, vertex_room;
+    size_t *corner; /* [corners]: the vertices of the polygon being read */
+    size_t corners, corner_room;
+    metroi_names materials, libraries;
+    metroi_slice wanted; /* the name after `usemtl` */
+    size_t wanted_line;
+    uint32_t material; /* 1 + the number of that name, once a face uses it */
+    int is_wanted;     /* no face has used it */
+} metroi_reader;
+
+static void metroi_reader_free(metroi_reader *reader)
+{
+    METRO_FREE(reader->part.corner);
+    METRO_FREE(reader->part.material_of);
+    METRO_FREE(reader->part.material);
+    METRO_FREE(reader->vertex);
+    METRO_FREE(reader->corner);
+    metroi_names_free(&reader->materials);
+    metroi_names_free(&reader->libraries);
+}
+
+/* A coordinate. Programs that divided by zero write `nan` or `-inf`, which are kept as NaN: a broken vertex should
+   not cost the whole scene. Returns 0 where there is no number. */
+static int metroi_line_coordinate(metroi_text *line, double *number)
+{
+    size_t start = line->at;
+    int byte;
+    if (metroi_text_real(line, number)) return 1;
+    line->at = start;
+    metroi_text_skip(line);
+    byte = metroi_text_peek(line);
+    if (byte == '-' || byte == '+') {
+        line->at++;
+        byte = metroi_text_peek(line);
+    }
+    if (byte != 'n' && byte != 'N' && byte != 'i' && byte != 'I') return 0;
+    while (!metroi_text_ends(line)) line->at++;
+    *number = METROI_NAN;
+    return 1;
+}
+
+/* `v x y z`; a fourth number is a weight of curves that we do not read, and more are colours. */
+static metro_result metroi_read_vertex(metroi_reader *reader)
+{
+    double number = 0;
+    float *place;
+    int k, finite = 1;
+    if (reader->vertices == reader->vertex_room) {
+        void *grown = metroi_grown(reader->vertex, &reader->vertex_room, reader->vertices + 1, 3 * sizeof *place);
+        if (grown == NULL) return METRO_ERROR_MEMORY;
+        reader->vertex = (float *)grown;
+    }
+    place = reader->vertex + 3 * reader->vertices;
+    for (k = 0; k < 3; k++) {
+        if (!metroi_line_coordinate(&reader->lines.line, &number))
+            return metroi_notes_refuse(&reader->notes, &reader->lines, "a vertex (v) needs three numbers");
+        place[k] = metroi_float(number);
+        finite = finite && isfinite(place[k]);
+    }
+    if (!finite && metroi_notes_warn(&reader->notes, METROI_WARN_INFINITE, reader->lines.file, reader->lines.number))
+        metroi_notes_add(&reader->notes, "a vertex is not finite: its triangles are never hit");
+    reader->vertices++;
+    return METRO_OK;
+}
+
+/* A vertex that is not there: the message says how many are. */
+static metro_result metroi_refuse_corner(metroi_reader *reader)
+{
+    metroi_notes_refuse(&reader->notes, &reader->lines, "a face (f) uses a vertex that is not there: ");
+    metroi_notes_number(&reader->notes, reader->vertices);
+    metroi_notes_add(&reader->notes, reader->vertices == 1 ? " stands above it" : " stand above it");
+    return METRO_ERROR_FORMAT;
+}
+
+/* A corner of a face is `v`, `v/vt`, `v//vn` or `v/vt/vn`, and only v matters here. It counts the vertices from 1, or
+   from the latest one backwards with -1, -2, ... A number too long to hold is too large in any case. */
+static metro_result metroi_read_corner(metroi_reader *reader, size_t *vertex)
+{
+    metroi_text *line = &reader->lines.line;
+    size_t number = 0, digits = 0;
+    int back = metroi_text_peek(line) == '-';
+    if (back) line->at++;
+    for (; metroi_is_digit(metroi_text_peek(line)); digits++, line->at++)
+        if (number <= SIZE_MAX / 20) number = 10 * number + (size_t)(line->bytes[line->at] - '0');
+    if (digits == 0 || (metroi_text_peek(line) != '/' && !metroi_text_ends(line)))
+        return metroi_notes_refuse(&reader->notes, &reader->lines,
+                                   "a corner of a face (f) is not a whole number such as 3, 3/1, 3//2 or -1");
+    while (!metroi_text_ends(line)) line->at++;
+    if (number == 0)
+        return metroi_notes_refuse(&reader->notes, &reader->lines,
+                                   "a face (f) uses vertex 0; the first vertex is number 1");
+    if (number > reader->vertices) return metroi_refuse_corner(reader);
+    *vertex = back ? reader->vertices - number : number - 1;
+    return METRO_OK;
+}
+
+static metro_result metroi_read_corners(metroi_reader *reader)
+{
+    metroi_text *line = &reader->lines.line;
+    reader->corners = 0;
+    for (;;) {
+        metro_result result;
+        metroi_text_skip(line);
+        if (line->at == line->size) return METRO_OK;
+        if (reader->corners == reader->corner_room) {
+            void *grown = metroi_grown(reader->corner, &reader->corner_room, reader->corners + 1,
+                                       sizeof *reader->corner);
+            if (grown == NULL) return METRO_ERROR_MEMORY;
+            reader->corner = (size_t *)grown;
+        }
+        result = metroi_read_corner(reader, &reader->corner[reader->corners]);
+        if (result != METRO_OK) return result;
+        reader->corners++;
+    }
+}
+
+/* Adds the triangle of three vertices; there is room for it. */
+static void metroi_reader_triangle(metroi_reader *reader, size_t a, size_t b, size_t c)
+{
+    float *place = reader->part.corner + 9 * reader->part.triangle_count;
+    memcpy(place, reader->vertex + 3 * a, 3 * sizeof *place);
+    memcpy(place + 3, reader->vertex + 3 * b, 3 * sizeof *place);
+    memcpy(place + 6, reader->vertex + 3 * c, 3 * sizeof *place);
+    reader->part.material_of[reader->part.triangle_count++] = reader->material;
+}
+
+/* # 9.8 Polygons
+
+   A triangle is itself. A convex polygon, or any other that can be seen whole from its first corner, is the fan from
+   there. The rest would be covered by a fan twice in one place and not at all in another, so we cut ears: a corner is
+   an ear when the polygon turns left there and no other corner is inside the triangle with its two neighbours. Every
+   polygon that does not cross itself has two ears (Meisters 1975), and without one of them it is a polygon of one
+   corner less.
+
+   Left and right need a plane. The normal of a polygon that need not be quite flat is the sum of the products of its
+   edges (Newell's method); we drop the axis along which that is longest, and order the other two so that the polygon
+   goes round counterclockwise. */
+
+typedef struct {
+    const float *vertex;
+    size_t *corner; /* [count]: what is left of the polygon */
+    size_t count;
+    int across, up; /* the two axes that are kept */
+} metroi_polygon;
+
+/* Twice the area of the triangle of three vertices in the plane: positive when it goes round counterclockwise. */
+static double metroi_polygon_turn(const metroi_polygon *polygon, size_t a, size_t b, size_t c)
+{
+    const float *p = polygon->vertex + 3 * a, *q = polygon->vertex + 3 * b, *r = polygon->vertex + 3 * c;
+    int x = polygon->across, y = polygon->up;
+    return ((double)q[x] - (double)p[x]) * ((double)r[y] - (double)p[y])
+        - ((double)q[y] - (double)p[y]) * ((double)r[x] - (double)p[x]);
+}
+
+/* Chooses the plane. Each of three planes is asked for the area of the polygon in it, summed as a fan, since the
+   components of Newell's normal are just that. Returns 0 when the polygon has no area. */
+static int metroi_polygon_flatten(metroi_polygon *polygon)
+{
+    const size_t *corner = polygon->corner;
+    int axis, best = 0;
+    double most = 0;
+    for (axis = 0; axis < 3; axis++) {
+        double area = 0;
+        size_t i;
+        polygon->across = (axis + 1) % 3;
+        polygon->up = (axis + 2) % 3;
+        for (i = 1; i + 1 < polygon->count; i++)
+            area += metroi_polygon_turn(polygon, corner[0], corner[i], corner[i + 1]);
+        if (!(fabs(area) > fabs(most))) continue;
+        most = area;
+        best = axis;
+    }
+    polygon->across = (best + (most > 0 ? 1 : 2)) % 3;
+    polygon->up = (best + (most > 0 ? 2 : 1)) % 3;
+    return most != 0 && isfinite(most);
+}
+
+/* The corner `steps` after corner i, going round. */
+static size_t metroi_polygon_at(const metroi_polygon *polygon, size_t i, size_t steps)
+{
+    size_t at = i + steps;
+    return polygon->corner[at < polygon->count ? at : at - polygon->count];
+}
+
+/* Can the whole polygon be seen from its first corner? Then no triangle of the fan turns right. */
+static int metroi_polygon_is_fan(const metroi_polygon *polygon)
+{
+    const size_t *corner = polygon->corner;
+    size_t i;
+    for (i = 1; i + 1 < polygon->count; i++)
+        if (metroi_polygon_turn(polygon, corner[0], corner[i], corner[i + 1]) < 0) return 0;
+    return 1;
+}
+
+static int metroi_vertices_agree(const metroi_polygon *polygon, size_t a, size_t b)
+{
+    const float *p = polygon->vertex + 3 * a, *q = polygon->vertex + 3 * b;
+    return p[0] == q[0] && p[1] == q[1] && p[2] == q[2];
+}
+
+/* Does the line from a over b to c turn back at b, or stand still? Asked where the three are in line. */
+static int metroi_polygon_turns_back(const metroi_polygon *polygon, size_t a, size_t b, size_t c)
+{
+    const float *p = polygon->vertex + 3 * a, *q = polygon->vertex + 3 * b, *r = polygon->vertex + 3 * c;
+    int x = polygon->across, y = polygon->up;
+    return ((double)p[x] - (double)q[x]) * ((double)r[x] - (double)q[x])
+               + ((double)p[y] - (double)q[y]) * ((double)r[y] - (double)q[y])
+        >= 0;
+}
+
+/* Is the corner after corner i an ear? A hole is written as a polygon with a cut from its border to the hole, whose
+   ends are there twice: a corner at the same place as one of the three does not spoil the ear. The tip of a spike
+   without width goes at once, since an ear beside it would not be one; any other corner in line with its neighbours
+   only where no ear is left (`flat`), since the polygon next door may have a corner there too. */
+static int metroi_polygon_is_ear(const metroi_polygon *polygon, size_t i, int flat)
+{
+    size_t a = polygon->corner[i], b = metroi_polygon_at(polygon, i, 1), c = metroi_polygon_at(polygon, i, 2), j;
+    double turn = metroi_polygon_turn(polygon, a, b, c);
+    if (!(turn > 0)) return turn == 0 && (flat || metroi_polygon_turns_back(polygon, a, b, c));
+    for (j = 0; j < polygon->count; j++) {
+        size_t d = polygon->corner[j];
+        if (metroi_polygon_turn(polygon, a, b, d) < 0 || metroi_polygon_turn(polygon, b, c, d) < 0
+            || metroi_polygon_turn(polygon, c, a, d) < 0)
+            continue;
+        if (!metroi_vertices_agree(polygon, d, a) && !metroi_vertices_agree(polygon, d, b)
+            && !metroi_vertices_agree(polygon, d, c))
+            return 0;
+    }
+    return 1;
+}
+
+/* Cuts the ear after corner i off. */
+static void metroi_polygon_cut_ear(metroi_reader *reader, metroi_polygon *polygon, size_t i)
+{
+    size_t ear = i + 1 < polygon->count ? i + 1 : 0;
+    metroi_reader_triangle(reader, polygon->corner[i], polygon->corner[ear], metroi_polygon_at(polygon, i, 2));
+    polygon->count--;
+    memmove(polygon->corner + ear, polygon->corner + ear + 1, (polygon->count - ear) * sizeof *polygon->corner);
+}
+
+/* Cuts ears until a triangle is left, or no ear is found, or the work exceeds what a polygon of so many corners may
+   cost: to look at a corner costs a step for each of the others, and a file of one polygon with a million corners
+   should not take a day. The bound lets a polygon of a thousand corners pass in most shapes. */
+
+enum { METROI_EAR_WORK = 2000 };
+
+static void metroi_polygon_cut(metroi_reader *reader, metroi_polygon *polygon)
+{
+    uint64_t most = (uint64_t)METROI_EAR_WORK * polygon->count, work = 0;
+    size_t misses = 0, i = 0;
+    while (polygon->count > 3 && misses < 2 * polygon->count && work < most) {
+        work += polygon->count;
+        if (i >= polygon->count) i = 0;
+        if (metroi_polygon_is_ear(polygon, i, misses >= polygon->count)) {
+            metroi_polygon_cut_ear(reader, polygon, i);
+            misses = 0;
+        } else {
+            misses++;
+            i++;
+        }
+    }
+}
+
+/* Splits the polygon that was read. The last triangle, and what ears could not be cut from, is a fan. */
+static metro_result metroi_reader_split(metroi_reader *reader)
+{
+    metroi_polygon polygon;
+    size_t i;
+    if (metroi_scene_grow(&reader->part, reader->corners - 2) != METRO_OK) return METRO_ERROR_MEMORY;
+    polygon.vertex = reader->vertex;
+    polygon.corner = reader->corner;
+    polygon.count = reader->corners;
+    if (polygon.count > 3 && metroi_polygon_flatten(&polygon) && !metroi_polygon_is_fan(&polygon)) {
+        metroi_polygon_cut(reader, &polygon);
+        if (polygon.count > 3
+            && metroi_notes_warn(&reader->notes, METROI_WARN_CROSSED, reader->lines.file, reader->lines.number))
+            metroi_notes_add(&reader->notes,
+                             "a polygon crosses itself or is too intricate: it may be covered wrongly");
+    }
+    for (i = 1; i + 1 < polygon.count; i++)
+        metroi_reader_triangle(reader, polygon.corner[0], polygon.corner[i], polygon.corner[i + 1]);
+    return METRO_OK;
+}
+
+/* `f` and its corners. The name of the material is looked up when a face uses it. */
+static metro_result metroi_read_face(metroi_reader *reader)
+{
+    metro_result result = metroi_read_corners(reader);
+    if (result != METRO_OK) return result;
+    if (reader->corners < 3) {
+        if (metroi_notes_warn(&reader->notes, METROI_WARN_CORNERS, reader->lines.file, reader->lines.number))
+            metroi_notes_add(&reader->notes, "a face (f) has fewer than three corners and is left out");
+        return METRO_OK;
+    }
+    if (reader->is_wanted) {
+        size_t name = metroi_names_add(&reader->materials, reader->wanted, reader->wanted_line);
+        if (name == 0 || name > 0xfffffffeu) return METRO_ERROR_MEMORY;
+        reader->material = (uint32_t)name;
+        reader->is_wanted = 0;
+    }
+    return metroi_reader_split(reader);
+}
+
+/* # 9.9 The OBJ file
+
+   Of the other keywords, `vt`, `vn`, `g`, `o` and `s` do not change what we draw, points, lines and curved surfaces
+   are not drawn, and what is unknown is skipped: files live longer than the programs that read them. */
+
+static int metroi_read_vector(metroi_text *line, metro_vec3 *vector)
+{
+    double number[3];
+    int k;
+    for (k = 0; k < 3; k++)
+        if (!metroi_text_real(line, &number[k]) || !isfinite(number[k])) return 0;
+    *vector = metro_vec3_make(number[0], number[1], number[2]);
+    while (metroi_is_blank(metroi_text_peek(line))) line->at++;
+    return 1;
+}
+
+/* The camera hides in a comment, where other programs do not look. */
+static void metroi_read_camera(metroi_reader *reader)
+{
+    metroi_text *line = &reader->lines.line;
+    metro_camera camera;
+    line->at++; /* past the `#` */
+    while (metroi_is_blank(metroi_text_peek(line))) line->at++;
+    if (!metroi_line_word(line, "camera") || !metroi_line_word(line, "eye")) return;
+    if (metroi_read_vector(line, &camera.eye) && metroi_line_word(line, "look")
+        && metroi_read_vector(line, &camera.look) && metroi_line_word(line, "up")
+        && metroi_read_vector(line, &camera.up) && metroi_line_word(line, "fov")
+        && metroi_text_real(line, &camera.fov) && isfinite(camera.fov)) {
+        reader->part.camera = camera;
+        reader->part.has_camera = 1;
+        return;
+    }
+    if (metroi_notes_warn(&reader->notes, METROI_WARN_CAMERA, reader->lines.file, reader->lines.number))
+        metroi_notes_add(&reader->notes, "left out, since a camera line has the form "
+                                         "# camera eye x y z look x y z up x y z fov DEGREES");
+}
+
+/* Material names and MTL files are only noted here. */
+static metro_result metroi_read_usemtl(metroi_reader *reader)
+{
+    reader->wanted = metroi_line_rest(&reader->lines.line);
+    reader->wanted_line = reader->lines.number;
+    reader->is_wanted = reader->wanted.length > 0;
+    reader->material = 0;
+    return METRO_OK;
+}
+
+static metro_result metroi_read_mtllib(metroi_reader *reader)
+{
+    metroi_slice name = metroi_line_rest(&reader->lines.line);
+    if (name.length == 0) return METRO_OK;
+    return metroi_names_add(&reader->libraries, name, reader->lines.number) != 0 ? METRO_OK : METRO_ERROR_MEMORY;
+}
+
+static metro_result metroi_read_obj_line(metroi_reader *reader)
+{
+    metroi_text *line = &reader->lines.line;
+    if (metroi_line_word(line, "v")) return metroi_read_vertex(reader);
+    if (metroi_line_word(line, "f")) return metroi_read_face(reader);
+    if (metroi_line_word(line, "usemtl")) return metroi_read_usemtl(reader);
+    if (metroi_line_word(line, "mtllib")) return metroi_read_mtllib(reader);
+    if (metroi_text_peek(line) == '#') metroi_read_camera(reader);
+    return METRO_OK;
+}
+
+/* All lines of the file. Memory that is lacking is told of here, once for all the functions above. */
+static metro_result metroi_read_obj(metroi_reader *reader, unsigned char *bytes, size_t size)
+{
+    metro_result result = METRO_OK;
+    reader->lines = metroi_lines_make(reader->lines.file, bytes, size);
+    while (result == METRO_OK && metroi_lines_next(&reader->lines)) result = metroi_read_obj_line(reader);
+    if (result == METRO_OK && reader->part.triangle_count == 0) {
+        reader->notes.at = 0;
+        metroi_notes_add(&reader->notes, reader->lines.file);
+        metroi_notes_add(&reader->notes, ": there is no face (f) in the file; is it an OBJ file?");
+        return METRO_ERROR_FORMAT;
+    }
+    return result;
+}
+
+/* # 9.10 The MTL file
+
+   A material is the lines from its `newmtl` to the next one. It is judged as a whole, and only when a face uses it;
+   of two with one name the first one counts. */
+
+typedef struct {
+    metro_material material;
+    metroi_name *name; /* NULL: nobody uses it, or it was defined before */
+    size_t line;
+    int has_kd, has_ke, is_negative, is_clear, has_texture;
+    double illum;
+} metroi_draft;
+
+/* One number for all colours, or three. */
+static int metroi_read_color(metroi_draft *draft, metroi_text *line, metro_vec3 *color)
+{
+    double part[3];
+    int k;
+    if (!metroi_text_real(line, &part[0]) || !isfinite(part[0])) return 0;
+    metroi_text_skip(line);
+    part[1] = part[2] = part[0];
+    for (k = 1; k < 3 && line->at < line->size; k++)
+        if (!metroi_text_real(line, &part[k]) || !isfinite(part[k])) return 0;
+    if (k == 2) return 0;
+    for (k = 0; k < 3; k++) {
+        if (part[k] < 0) draft->is_negative = 1;
+        if (!(part[k] > 0)) part[k] = 0;
+    }
+    *color = metro_vec3_make(part[0], part[1], part[2]);
+    return 1;
+}
+
+static int metroi_read_exponent(metroi_draft *draft, metroi_text *line)
+{
+    double ns;
+    if (!metroi_text_real(line, &ns) || !isfinite(ns)) return 0;
+    if (ns < 0) draft->is_negative = 1;
+    draft->material.ns = ns > 0 ? ns : 0;
+    return 1;
+}
+
+/* What is not read, but would change the picture. `Tr` is 1 - d, and `Tr 1` is how some programs write opaque. */
+static void metroi_read_ignored(metroi_draft *draft, metroi_text *line)
+{
+    double number = 0;
+    if (metroi_line_word(line, "d")) {
+        metroi_line_word(line, "-halo");
+        if (metroi_text_real(line, &number) && number < 1) draft->is_clear = 1;
+    } else if (metroi_line_word(line, "Tr")) {
+        if (metroi_text_real(line, &number) && number > 0 && number < 1) draft->is_clear = 1;
+    } else if (metroi_line_word(line, "illum")) {
+        if (metroi_text_real(line, &number)) draft->illum = number;
+    } else if (metroi_line_word(line, "bump") || metroi_line_word(line, "norm") || metroi_line_word(line, "disp")) {
+        draft->has_texture = 1;
+    } else if (line->size - line->at > 4 && memcmp(line->bytes + line->at, "map_", 4) == 0) {
+        draft->has_texture = draft->has_texture || !metroi_line_word(line, "map_Ka");
+    }
+}
+
+/* A line of a material that is used. Returns 0 when it is wrong. */
+static int metroi_read_mtl_line(metroi_draft *draft, metroi_text *line)
+{
+    if (metroi_line_word(line, "Kd")) {
+        draft->has_kd = 1;
+        return metroi_read_color(draft, line, &draft->material.kd);
+    }
+    if (metroi_line_word(line, "Ke")) {
+        draft->has_ke = 1;
+        return metroi_read_color(draft, line, &draft->material.ke);
+    }
+    if (metroi_line_word(line, "Ks")) return metroi_read_color(draft, line, &draft->material.ks);
+    if (metroi_line_word(line, "Ns")) return metroi_read_exponent(draft, line);
+    metroi_read_ignored(draft, line);
+    return 1;
+}
+
+/* Programs write Ks .5 beside Kd .8 without a thought for energy. Takes what is too much from Ks. */
+static int metroi_lower(double *kd, double *ks)
+{
+    int lowered = *kd + *ks > 1 + 1e-9;
+    if (lowered) *ks = 1 - *kd;
+    return lowered;
+}
+
+static int metroi_cap(double *value)
+{
+    int capped = *value > 1;
+    if (capped) *value = 1;
+    return capped;
+}
+
+static void metroi_draft_warn(metroi_reader *reader, const metroi_draft *draft, const char *file, int kind,
+                              const char *what)
+{
+    if (!metroi_notes_warn(&reader->notes, kind, file, draft->line)) return;
+    metroi_notes_add(&reader->notes, "material ");
+    metroi_notes_slice(&reader->notes, draft->name->slice);
+    metroi_notes_add(&reader->notes, what);
+}
+
+/* Makes the numbers of a material possible. What | joins is done for all three colours; || would stop early. */
+static void metroi_draft_mend(metroi_reader *reader, metroi_draft *draft, const char *file)
+{
+    metro_vec3 *kd = &draft->material.kd, *ks = &draft->material.ks;
+    if (!draft->has_kd && !draft->has_ke) *kd = metroi_scene_material(&reader->part, 0)->kd;
+    if (draft->is_negative)
+        metroi_draft_warn(reader, draft, file, METROI_WARN_NEGATIVE, " has a negative number; it is taken as 0");
+    if (metroi_cap(&kd->x) | metroi_cap(&kd->y) | metroi_cap(&kd->z))
+        metroi_draft_warn(reader, draft, file, METROI_WARN_BRIGHT, " has Kd above 1; it is taken as 1");
+    if (metroi_lower(&kd->x, &ks->x) | metroi_lower(&kd->y, &ks->y) | metroi_lower(&kd->z, &ks->z))
+        metroi_draft_warn(reader, draft, file, METROI_WARN_GLOSSY,
+                          " has Kd + Ks above 1, more light than it receives; Ks is taken as 1 - Kd");
+}
+
+static void metroi_draft_tell(metroi_reader *reader, const metroi_draft *draft, const char *file)
+{
+    metro_vec3 ks = draft->material.ks;
+    int is_glossy = ks.x > 0 || ks.y > 0 || ks.z > 0;
+    if (draft->is_clear)
+        metroi_draft_warn(reader, draft, file, METROI_WARN_CLEAR, " is transparent (d, Tr); it is drawn opaque");
+    if (draft->has_texture)
+        metroi_draft_warn(reader, draft, file, METROI_WARN_TEXTURE, " has textures (map_); they are not read");
+    if (draft->illum > 2 && is_glossy)
+        metroi_draft_warn(reader, draft, file, METROI_WARN_ILLUM,
+                          " asks for a mirror or glass (illum); it is drawn with Kd, Ks and Ns alone");
+    if (draft->illum >= 0 && draft->illum < 2 && is_glossy)
+        metroi_draft_warn(reader, draft, file, METROI_WARN_ILLUM,
+                          " switches Ks off (illum 0 or 1); it is drawn with Ks all the same");
+}
+
+/* The end of a material: into the scene with it, if a face uses it. */
+static metro_result metroi_draft_close(metroi_reader *reader, metroi_draft *draft, const char *file)
+{
+    metro_result result;
+    if (draft->name == NULL) return METRO_OK;
+    metroi_draft_tell(reader, draft, file);
+    metroi_draft_mend(reader, draft, file);
+    result = metro_scene_add_material(&reader->part, &draft->material, &draft->name->material);
+    if (result == METRO_OK) draft->name->is_defined = 1;
+    return result;
+}
+
+static void metroi_draft_open(metroi_reader *reader, metroi_draft *draft, const metroi_lines *lines)
+{
+    metroi_slice slice = metroi_line_rest(&lines->line);
+    memset(draft, 0, sizeof *draft);
+    draft->illum = 2;
+    draft->line = lines->number;
+    draft->name = metroi_names_find(&reader->materials, slice);
+    if (draft->name != NULL && draft->name->is_defined) draft->name = NULL;
+}
+
+static metro_result metroi_read_mtl(metroi_reader *reader, const char *file, unsigned char *bytes, size_t size)
+{
+    metroi_lines lines = metroi_lines_make(file, bytes, size);
+    metroi_draft draft;
+    memset(&draft, 0, sizeof draft);
+    while (metroi_lines_next(&lines)) {
+        if (metroi_line_word(&lines.line, "newmtl")) {
+            metro_result result = metroi_draft_close(reader, &draft, file);
+            if (result != METRO_OK) return result;
+            metroi_draft_open(reader, &draft, &lines);
+        } else if (draft.name != NULL && !metroi_read_mtl_line(&draft, &lines.line)) {
+            return metroi_notes_refuse(&reader->notes, &lines,
+                                       "Kd, Ks and Ke need one or three numbers, and Ns needs one");
+        }
+    }
+    return metroi_draft_close(reader, &draft, file);
+}
+
+/* # 9.11 Finding the MTL file
+
+   `mtllib` names files from the folder of the OBJ. Where a name cannot be opened we try what people meant: the words
+   of the line, since it may name several files (though most programs mean one whose name has blanks); and the last
+   part of the path, since scenes move from the machine where they were made to another. */
+
+static int metroi_is_slash(int byte)
+{
+    return byte == '/' || byte == '\\';
+}
+
+/* The path of the file `name`, which is the caller's to free; NULL when there is no memory. */
+static char *metroi_library_path(const char *obj, metroi_slice name)
+{
+    size_t folder = strlen(obj), i;
+    char *path;
+    while (folder > 0 && !metroi_is_slash(obj[folder - 1])) folder--;
+    if (metroi_is_slash(name.text[0]) || (name.length > 1 && name.text[1] == ':')) folder = 0;
+    path = (char *)METRO_MALLOC(folder + name.length + 1);
+    if (path == NULL) return NULL;
+    memcpy(path, obj, folder);
+    for (i = 0; i < name.length; i++) path[folder + i] = name.text[i] == '\\' ? '/' : (char)name.text[i];
+    path[folder + name.length] = 0;
+    return path;
+}
+
+/* Reads one MTL file. `found` says whether it could be read. */
+static metro_result metroi_library_read(metroi_reader *reader, metroi_slice name, int *found)
+{
+    char *path = metroi_library_path(reader->lines.file, name);
+    metro_result result = METRO_ERROR_FILE;
+    unsigned char *bytes = NULL;
+    const char *why;
+    size_t size = 0;
+    FILE *file;
+    if (path == NULL) return METRO_ERROR_MEMORY;
+    file = metroi_is_special(path) ? NULL : fopen(path, "rb");
+    if (file != NULL) {
+        result = metroi_file_read(file, &bytes, &size, &why);
+        fclose(file);
+    }
+    *found = result == METRO_OK;
+    if (result == METRO_OK) result = metroi_read_mtl(reader, path, bytes, size);
+    else if (result == METRO_ERROR_FILE) result = METRO_OK;
+    METRO_FREE(bytes);
+    METRO_FREE(path);
+    return result;
+}
+
+/* The same file is read once, however often it is named. A name that was tried has the material number 1. */
+static metro_result metroi_library_try(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
+{
+    size_t number = metroi_names_add(&reader->libraries, slice, line);
+    metro_result result = METRO_OK;
+    metroi_name *name;
+    if (number == 0) return METRO_ERROR_MEMORY;
+    name = &reader->libraries.name[number - 1];
+    if (name->material == 0) {
+        result = metroi_library_read(reader, slice, &name->is_defined);
+        name->material = 1;
+    }
+    *found = *found || name->is_defined;
+    return result;
+}
+
+/* The words of a line, one by one. */
+static metro_result metroi_library_words(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
+{
+    size_t at = 0;
+    while (at < slice.length) {
+        metroi_slice word;
+        metro_result result;
+        word.text = slice.text + at;
+        word.length = 0;
+        while (at < slice.length && !metroi_is_blank(slice.text[at])) {
+            at++;
+            word.length++;
+        }
+        while (at < slice.length && metroi_is_blank(slice.text[at])) at++;
+        result = metroi_library_try(reader, word, line, found);
+        if (result != METRO_OK) return result;
+    }
+    return METRO_OK;
+}
+
+/* The last part of a path. */
+static metro_result metroi_library_last(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
+{
+    metroi_slice last = slice;
+    size_t at = slice.length;
+    while (at > 0 && !metroi_is_slash(slice.text[at - 1])) at--;
+    last.text = slice.text + at;
+    last.length = slice.length - at;
+    if (at == 0 || last.length == 0) return METRO_OK;
+    return metroi_library_try(reader, last, line, found);
+}
+
+static metro_result metroi_read_library(metroi_reader *reader, metroi_slice slice, size_t line)
+{
+    int found = 0;
+    metro_result result = metroi_library_try(reader, slice, line, &found);
+    if (result == METRO_OK && !found) result = metroi_library_words(reader, slice, line, &found);
+    if (result == METRO_OK && !found) result = metroi_library_last(reader, slice, line, &found);
+    if (result != METRO_OK || found) return result;
+    if (metroi_notes_warn(&reader->notes, METROI_WARN_LIBRARY, reader->lines.file, line)) {
+        metroi_notes_add(&reader->notes, "the MTL file cannot be read: ");
+        metroi_notes_slice(&reader->notes, slice);
+    }
+    return METRO_OK;
+}
+
+/* All MTL files, in the order of the lines that name them; words that are tried on the way stand behind these. */
+static metro_result metroi_read_libraries(metroi_reader *reader)
+{
+    size_t i, lines = reader->libraries.count;
+    metro_result result = METRO_OK;
+    for (i = 0; i < lines && result == METRO_OK; i++)
+        result = metroi_read_library(reader, reader->libraries.name[i].slice, reader->libraries.name[i].line);
+    return result;
+}
+
+/* # 9.12 Joining the caller's scene
+
+   The triangles give up the numbers of names for those of materials. What was never defined becomes material 0. */
+
+static void metroi_reader_settle(metroi_reader *reader)
+{
+    metroi_names *names = &reader->materials;
+    size_t i;
+    for (i = 0; i < names->count; i++) {
+        if (names->name[i].is_defined) continue;
+        if (!metroi_notes_warn(&reader->notes, METROI_WARN_NAME, reader->lines.file, names->name[i].line)) break;
+        metroi_notes_add(&reader->notes, "no MTL file defines the material ");
+        metroi_notes_slice(&reader->notes, names->name[i].slice);
+        metroi_notes_add(&reader->notes, "; it is drawn with Kd 0.5");
+    }
+    for (i = 0; i < reader->part.triangle_count; i++) {
+        uint32_t name = reader->part.material_of[i];
+        reader->part.material_of[i] = name > 0 ? names->name[name - 1].material : 0;
+    }
+}
+
+/* Copies the materials of `part` behind those of `scene`. */
+static metro_result metroi_scene_join_materials(metro_scene *scene, const metro_scene *part)
+{
+    size_t count = scene->material_count + part->material_count;
+    if (count > 0xfffffffeu) return METRO_ERROR_MEMORY;
+    if (count > scene->material_room) {
+        void *grown = metroi_grown(scene->material, &scene->material_room, count, sizeof *scene->material);
+        if (grown == NULL) return METRO_ERROR_MEMORY;
+        scene->material = (metro_material *)grown;
+    }
+    if (part->material_count > 0)
+        memcpy(scene->material + scene->material_count, part->material,
+               part->material_count * sizeof *scene->material);
+    scene->material_count = count;
+    return METRO_OK;
+}
+
+/* Gives back the room that the growing lists did not need. Where that fails they stay as they are. */
+static void metroi_scene_trim(metro_scene *scene)
+{
+    void *trimmed = METRO_REALLOC(scene->corner, 9 * scene->triangle_count * sizeof *scene->corner);
+    if (trimmed == NULL) return;
+    scene->corner = (float *)trimmed;
+    scene->triangle_room = scene->triangle_count;
+    trimmed = METRO_REALLOC(scene->material_of, scene->triangle_count * sizeof *scene->material_of);
+    if (trimmed != NULL) scene->material_of = (uint32_t *)trimmed;
+}
+
+/* Takes `part` into `scene`: into an empty one by handing over its lists, else by copying. */
+static metro_result metroi_scene_join(metro_scene *scene, metro_scene *part)
+{
+    uint32_t first = (uint32_t)scene->material_count;
+    size_t i;
+    if (scene->corner == NULL && scene->material_of == NULL && scene->material == NULL) {
+        if (!part->has_camera) part->camera = scene->camera;
+        part->has_camera = part->has_camera || scene->has_camera;
+        *scene = *part;
+        memset(part, 0, sizeof *part);
+        metroi_scene_trim(scene);
+        return METRO_OK;
+    }
+    if (metroi_scene_grow(scene, part->triangle_count) != METRO_OK) return METRO_ERROR_MEMORY;
+    if (metroi_scene_join_materials(scene, part) != METRO_OK) return METRO_ERROR_MEMORY;
+    memcpy(scene->corner + 9 * scene->triangle_count, part->corner, 9 * part->triangle_count * sizeof *part->corner);
+    for (i = 0; i < part->triangle_count; i++) {
+        uint32_t material = part->material_of[i];
+        scene->material_of[scene->triangle_count + i] = material > 0 ? first + material : 0;
+    }
+    scene->triangle_count += part->triangle_count;
+    if (part->has_camera) scene->camera = part->camera;
+    scene->has_camera = scene->has_camera || part->has_camera;
+    return METRO_OK;
+}
+
+/* From the bytes of an OBJ to the scene. `mtl` holds the MTL, or is NULL when files are to be looked for. */
+static metro_result metroi_scene_read(metro_scene *scene, metroi_reader *reader, unsigned char *obj, size_t obj_size,
+                                      unsigned char *mtl, size_t mtl_size)
+{
+    metro_result result = metroi_read_obj(reader, obj, obj_size);
+    if (result == METRO_OK && mtl != NULL) result = metroi_read_mtl(reader, "mtl", mtl, mtl_size);
+    if (result == METRO_OK && mtl == NULL) result = metroi_read_libraries(reader);
+    if (result == METRO_OK) {
+        metroi_reader_settle(reader);
+        result = metroi_scene_join(scene, &reader->part);
+    }
+    return result == METRO_ERROR_MEMORY ? metroi_notes_memory(&reader->notes, reader->lines.file) : result;
+}
+
+static void metroi_reader_make(metroi_reader *reader, const char *file, char *message, size_t message_size)
+{
+    memset(reader, 0, sizeof *reader);
+    reader->lines.file = file;
+    reader->notes.message = message;
+    reader->notes.size = message_size;
+    if (message != NULL && message_size > 0) message[0] = 0;
+}
+
+METRO_API metro_result metro_scene_load_obj(metro_scene *scene, const char *path, char *message, size_t message_size)
+{
+    const char *why = "no scene, no path, or a scene that is built already; see the contract of metro_scene_load_obj";
+    metro_result result = METRO_ERROR_ARGUMENT;
+    unsigned char *bytes = NULL;
+    size_t size = 0;
+    if (scene != NULL && path != NULL && scene->bvh == NULL) {
+        FILE *file = fopen(path, "rb");
+        why = "the file cannot be opened; check that it exists and that you may read it";
+        result = file == NULL ? METRO_ERROR_FILE : metroi_file_read(file, &bytes, &size, &why);
+        if (file != NULL) fclose(file);
+        if (result == METRO_ERROR_MEMORY) why = "there is not enough memory for the scene";
+    }
+    if (result == METRO_OK) {
+        metroi_reader reader;
+        metroi_reader_make(&reader, path, message, message_size);
+        result = metroi_scene_read(scene, &reader, bytes, size, NULL, 0);
+        metroi_reader_free(&reader);
+    } else {
+        metroi_tell(message, message_size, path, why);
+    }
+    METRO_FREE(bytes);
+    return result;
+}
+
+/* The bytes are evened out in a copy; one block holds both files, so that an empty MTL has a place too. */
+
+METRO_API metro_result metro_scene_parse_obj(metro_scene *scene, const unsigned char *obj, size_t obj_size,
+                                             const unsigned char *mtl, size_t mtl_size, char *message,
+                                             size_t message_size)
+{
+    metroi_reader reader;
+    metro_result result = METRO_ERROR_MEMORY;
+    unsigned char *bytes = NULL;
+    if (scene == NULL || scene->bvh != NULL || (obj == NULL && obj_size > 0) || (mtl == NULL && mtl_size > 0)) {
+        metroi_tell(message, message_size, NULL, "no scene, no bytes, or a scene that is built already");
+        return METRO_ERROR_ARGUMENT;
+    }
+    metroi_reader_make(&reader, "obj", message, message_size);
+    if (obj_size < SIZE_MAX && mtl_size < SIZE_MAX - obj_size)
+        bytes = (unsigned char *)METRO_MALLOC(obj_size + mtl_size + 1);
+    if (bytes != NULL) {
+        if (obj_size > 0) memcpy(bytes, obj, obj_size);
+        if (mtl_size > 0) memcpy(bytes + obj_size, mtl, mtl_size);
+        result = metroi_scene_read(scene, &reader, bytes, obj_size, bytes + obj_size, mtl_size);
+        metroi_reader_free(&reader);
+    } else {
+        metroi_notes_memory(&reader.notes, "obj");
+    }
+    METRO_FREE(bytes);
+    return result;
+}
+
+#endif /* METRO_NO_TRACER */
 #ifdef METROI_COMPILE_FAST
 #pragma GCC pop_options
 #undef METROI_COMPILE_FAST
 #endif
+#ifndef METRO_NO_TRACER
+
+/* # 10 BVH
+
+   Light travels along rays, and the one question a ray asks is which triangle it meets first. Asking every triangle
+   answers it, at a cost that grows with their number. A bounding volume hierarchy is a tree of boxes: each box holds
+   all the triangles below it, so a ray that misses the box need not look at any of them. Half a million triangles
+   then cost a ray about a dozen boxes.
+
+   The chapter has three parts. First the tree is built: where to cut a heap of triangles (10.2), how to make a wide
+   tree of a narrow one (10.3), how it lies in memory (10.4). Then come the two tests that a ray makes, against boxes
+   (10.6) and triangles (10.7), which must not let a ray slip through between two neighbours; the same tests for
+   several boxes and triangles at once (10.8); and the walk (10.9). Last, how a ray leaves the surface that it was
+   reflected by without meeting it again (10.10). */
+
+#if defined(__GNUC__) || defined(__clang__)
+#define METROI_INLINE __attribute__((always_inline)) static inline
+#define METROI_ALIGNED __attribute__((aligned(32)))
+#else
+#define METROI_INLINE static inline
+#define METROI_ALIGNED
+#endif
+#define METROI_LEAF 0x80000000u /* the bit of a child that is a leaf */
+#define METROI_NONE 0xFFFFFFFFu /* no child, no triangle */
+
+/* # 10.1 Nodes and blocks
+
+   A node holds the boxes of up to eight children, number by number: eight lower x, then eight lower y, and so on, the
+   way that instructions for eight numbers at once read them. A child is the number of a node, or, with METROI_LEAF
+   set, of a leaf. A leaf is one block or two, and a block four triangles, again number by number. Corners lie in the
+   block itself: to follow an index to a vertex somewhere else would cost more than the test.
+
+   Floats are half as large as doubles and twice as many fit an instruction. So that none of their products leaves
+   their range, whatever unit the scene is in, coordinates are divided by a power of two that brings the largest into
+   [1/2, 1); dividing by it rounds nothing. */
+
+typedef struct {
+    float bound[6][8]; /* lower x, y, z, then upper x, y, z, of the eight children */
+    uint32_t child[8];
+    uint32_t idle[8]; /* to 256 bytes: four lines of the cache, and a shift finds a node */
+} metroi_node;
+
+typedef struct {
+    float corner[3][3][4]; /* [corner][axis][triangle] */
+    uint32_t triangle[4];  /* their numbers */
+} metroi_block;
+
+/* Which instructions the walk uses; the tests set it to compare them. */
+typedef enum { METROI_PLAIN, METROI_FOUR, METROI_EIGHT } metroi_path;
+
+typedef struct {
+    metroi_path path;
+    double size, scale; /* a power of two, and one over it */
+    metroi_node *nodes; /* the first is the root */
+    metroi_block *blocks;
+    size_t node_count, block_count;
+    void *node_memory, *block_memory; /* what nodes and blocks lie in */
+} metroi_bvh;
+
+METROI_INLINE float metroi_low(float a, float b)
+{
+    return a < b ? a : b;
+}
+
+METROI_INLINE float metroi_high(float a, float b)
+{
+    return a > b ? a : b;
+}
+
+/* While the tree is being built a triangle is no more than its box. Boxes have a fourth, idle number in each half, so
+   that compilers may use instructions for four; a triangle keeps its own number there. */
+
+typedef struct {
+    float lo[4], hi[4];
+} metroi_box;
+
+typedef struct {
+    metroi_box box; /* lo[3] holds the bits of the triangle's number */
+} metroi_item;
+
+static uint32_t metroi_item_triangle(const metroi_item *item)
+{
+    uint32_t triangle;
+    memcpy(&triangle, &item->box.lo[3], sizeof triangle);
+    return triangle;
+}
+
+/* Makes the item of a triangle, and says whether the triangle is finite: the sum of nine scaled coordinates is finite
+   unless one of them is not. */
+static int metroi_item_make(const float *corner, double scale, uint32_t triangle, metroi_item *item)
+{
+    float p[9], sum = 0;
+    int i, k;
+    for (i = 0; i < 9; i++) {
+        p[i] = (float)((double)corner[i] * scale);
+        sum += p[i];
+    }
+    for (k = 0; k < 3; k++) {
+        item->box.lo[k] = metroi_low(metroi_low(p[k], p[k + 3]), p[k + 6]);
+        item->box.hi[k] = metroi_high(metroi_high(p[k], p[k + 3]), p[k + 6]);
+    }
+    memcpy(&item->box.lo[3], &triangle, sizeof triangle);
+    item->box.hi[3] = 0;
+    return isfinite(sum);
+}
+
+static void metroi_box_clear(metroi_box *box)
+{
+    int k;
+    for (k = 0; k < 4; k++) {
+        box->lo[k] = 8;
+        box->hi[k] = -8;
+    }
+}
+
+METROI_INLINE void metroi_box_add(metroi_box *box, const metroi_box *more)
+{
+    int k;
+    for (k = 0; k < 4; k++) box->lo[k] = metroi_low(more->lo[k], box->lo[k]);
+    for (k = 0; k < 4; k++) box->hi[k] = metroi_high(more->hi[k], box->hi[k]);
+}
+
+/* Half the area of a box's surface. */
+static float metroi_box_area(const metroi_box *box)
+{
+    float x = box->hi[0] - box->lo[0], y = box->hi[1] - box->lo[1], z = box->hi[2] - box->lo[2];
+    return x * y + y * z + z * x;
+}
+
+/* # 10.2 Where to cut
+
+   The tree is built from its root: cut the heap of triangles in two, then each half again. A good cut gives small
+   boxes with few triangles. How small counts follows from geometry: of the random lines that meet a convex body,
+   those that also meet a convex body inside it are a share that is the ratio of the two surface areas. So the
+   expected cost of a ray that has come to node n is
+
+       C(n) = c_n + frac{A_l}{A_n} C(l) + frac{A_r}{A_n} C(r)                       (10.1)
+
+   with the cost $c_n$ of a look at the node's children l and r: the surface area heuristic (Goldsmith and Salmon
+   1987; MacDonald and Booth 1990). We cannot know C(l) before l has been cut, so we take what it would cost uncut. A
+   leaf is tested in blocks of four, and five triangles cost as much as eight; hence the cut minimises
+
+       A_l q_l + A_r q_r,   q = N/4 "rounded up"                       (10.2)
+
+   with $N_l$ and $N_r$ triangles on the two sides. */
+
+METROI_INLINE float metroi_blocks_of(uint32_t count)
+{
+    return (float)((count + 3) / 4);
+}
+
+typedef struct {
+    metroi_box box, centre; /* of the triangles, and of twice the centres of their boxes */
+    uint32_t first, count;  /* a range of items */
+} metroi_range;
+
+static void metroi_range_clear(metroi_range *range, uint32_t first)
+{
+    metroi_box_clear(&range->box);
+    metroi_box_clear(&range->centre);
+    range->first = first;
+    range->count = 0;
+}
+
+METROI_INLINE void metroi_range_add(metroi_range *range, const metroi_item *item)
+{
+    metroi_box centre;
+    int k;
+    for (k = 0; k < 4; k++) centre.lo[k] = centre.hi[k] = item->box.lo[k] + item->box.hi[k];
+    metroi_box_add(&range->box, &item->box);
+    metroi_box_add(&range->centre, &centre);
+    range->count++;
+}
+
+/* Not every cut is tried. The span of the centres is divided into at most 16 bins along each axis, each triangle goes
+   into one bin an axis, and the cuts are those between bins (Wald 2007); 32 bins make no better trees. Small heaps
+   get fewer, since bins cost time even when they are empty. */
+
+enum { METROI_BINS = 16 };
+
+typedef struct {
+    metroi_box box[METROI_BINS];
+    uint32_t count[METROI_BINS];
+} metroi_bins;
+
+typedef struct {
+    float cost, origin, scale;
+    int axis, bin, bins; /* bins below `bin` go to the left; axis -1: no cut was found */
+} metroi_split;
+
+METROI_INLINE int metroi_bin_of(const metroi_item *item, int axis, float origin, float scale, int bins)
+{
+    int bin = (int)((item->box.lo[axis] + item->box.hi[axis] - origin) * scale);
+    return bin < bins ? bin : bins - 1;
+}
+
+/* Tries the cuts along one axis: from the right, what each cut leaves on its right; then from the left, the rest. */
+static void metroi_split_sweep(const metroi_bins *bins, int count, int axis, metroi_split *best)
+{
+    float right[METROI_BINS];
+    metroi_box box;
+    uint32_t n = 0;
+    int i;
+    metroi_box_clear(&box);
+    for (i = count - 1; i > 0; i--) {
+        n += bins->count[i];
+        metroi_box_add(&box, &bins->box[i]);
+        right[i] = n > 0 ? metroi_box_area(&box) * metroi_blocks_of(n) : -1;
+    }
+    metroi_box_clear(&box);
+    for (i = 1, n = 0; i < count; i++) {
+        float cost;
+        n += bins->count[i - 1];
+        metroi_box_add(&box, &bins->box[i - 1]);
+        if (n == 0 || right[i] < 0) continue; /* all on one side is no cut */
+        cost = metroi_box_area(&box) * metroi_blocks_of(n) + right[i]; /* eq 10.2, the part of eq 10.1 that varies */
+        if (cost < best->cost) {
+            best->cost = cost;
+            best->axis = axis;
+            best->bin = i;
+        }
+    }
+}
+
+static void metroi_bins_fill(metroi_bins bins[3], const metroi_item *item, const metroi_range *range,
+                             const float scale[3], int count)
+{
+    uint32_t j;
+    int i, k;
+    for (k = 0; k < 3; k++)
+        for (i = 0; i < count; i++) {
+            metroi_box_clear(&bins[k].box[i]);
+            bins[k].count[i] = 0;
+        }
+    for (j = range->first; j < range->first + range->count; j++)
+        for (k = 0; k < 3; k++) {
+            i = metroi_bin_of(&item[j], k, range->centre.lo[k], scale[k], count);
+            bins[k].count[i]++;
+            metroi_box_add(&bins[k].box[i], &item[j].box);
+        }
+}
+
+static metroi_split metroi_split_find(const metroi_item *item, const metroi_range *range)
+{
+    metroi_split best = { 1e30f, 0, 0, -1, 0, 0 };
+    metroi_bins bins[3];
+    float scale[3];
+    int k;
+    best.bins = range->count < 240 ? 4 + (int)range->count / 20 : METROI_BINS;
+    for (k = 0; k < 3; k++) {
+        float extent = range->centre.hi[k] - range->centre.lo[k];
+        scale[k] = extent > 1e-30f ? (float)best.bins * 0.99999f / extent : 0; /* centres on one spot stay together */
+    }
+    metroi_bins_fill(bins, item, range, scale, best.bins);
+    for (k = 0; k < 3; k++)
+        if (scale[k] > 0) metroi_split_sweep(&bins[k], best.bins, k, &best);
+    if (best.axis >= 0) {
+        best.origin = range->centre.lo[best.axis];
+        best.scale = scale[best.axis];
+    }
+    return best;
+}
+
+static int metroi_split_bin(const metroi_split *split, const metroi_item *item)
+{
+    return metroi_bin_of(item, split->axis, split->origin, split->scale, split->bins);
+}
+
+/* Sorts the items of a range to both sides of a cut, from both ends inwards. Where no cut was found, because all
+   centres coincide or for the reason below, the first half of the items goes to the left. */
+static void metroi_range_split(metroi_item *item, const metroi_range *range, const metroi_split *split,
+                               metroi_range *left, metroi_range *right)
+{
+    uint32_t i = range->first, end = i + range->count, middle = i + range->count / 2;
+    metroi_range_clear(left, i);
+    metroi_range_clear(right, end);
+    while (i < end) {
+        int is_left = i < middle;
+        if (split->axis >= 0) is_left = metroi_split_bin(split, &item[i]) < split->bin;
+        if (is_left) metroi_range_add(left, &item[i++]);
+        else {
+            metroi_item other = item[--end];
+            item[end] = item[i];
+            item[i] = other;
+            metroi_range_add(right, &item[end]);
+        }
+    }
+    right->first = end;
+}
+
+/* # 10.3 From two children to eight
+
+   The cuts make a binary tree, and its inner nodes are forks. A ray is better served by nodes with eight children,
+   whose boxes are tested at once. So a node of the final tree stands for a fork and some of the forks below it, and
+   the question is which. Let C(n, i) be the least cost, times the area, of fork n when it appears as at most i
+   children of some node. As one child it is a leaf of at most two blocks, or a node with children of its own; as more
+   it shares them out between its two halves:
+
+       C(n, 1) = min(A_n q_n, A_n + C(n, 8))                                             (10.3)
+       C(n, i) = min(C(n, i - 1), min_{0 < k < i} (C(l, k) + C(r, i - k)))               (10.4)
+
+   Looking at a node and testing a block cost the same here, which is about true. Since a fork comes after its parent
+   in the list, one pass from the end to the front computes all costs; `part` remembers the choices (Wald, Benthin and
+   Boulos 2008; Ylitie, Karras and Laine 2017). */
+
+enum { METROI_WIDTH = 8, METROI_LEAF_MOST = 8, METROI_CUT_DEPTH = 40, METROI_DEPTH = 72 };
+
+typedef struct {
+    metroi_box box;
+    uint32_t first, count;               /* its items */
+    uint32_t left, right;                /* forks; 0 where it was not cut */
+    float cost[METROI_WIDTH + 1];        /* [i]: C(n, i) */
+    unsigned char part[METROI_WIDTH + 1]; /* [i]: so many children for the left half, or 0: make do with i - 1; */
+                                         /* [1]: 0 for a leaf */
+    uint32_t node, waiting;              /* its node, and an entry of the stack of metroi_build_wide */
+} metroi_fork;
+
+typedef struct {
+    const metro_scene *scene;
+    metroi_bvh *bvh;
+    metroi_item *item;
+    metroi_fork *fork;
+    size_t fork_count, fork_room;
+} metroi_builder;
+
+static int metroi_fork_add(metroi_builder *b, const metroi_range *range, uint32_t *index)
+{
+    metroi_fork *fork = b->fork;
+    if (b->fork_count == b->fork_room) {
+        size_t size, room = b->fork_room + b->fork_room / 2;
+        if (!metroi_size_multiply(room, sizeof *fork, &size)) return 0;
+        fork = (metroi_fork *)METRO_REALLOC(b->fork, size);
+        if (fork == NULL) return 0;
+        b->fork = fork;
+        b->fork_room = room;
+    }
+    *index = (uint32_t)b->fork_count++;
+    fork += *index;
+    memset(fork, 0, sizeof *fork);
+    fork->box = range->box;
+    fork->first = range->first;
+    fork->count = range->count;
+    return 1;
+}
+
+/* Four triangles fill a block and are not cut, unless their box is so large, a 256th of the whole surface, that it
+   would often be entered for nothing: the walls of an empty room share no block. Whether the cut is used is for eq
+   10.3 to say.
+
+   Cuts by area may peel off one triangle at a time and make a tree as deep as a list. From depth 40 on we halve,
+   which ends within 30 more levels, and so the depth of all trees is bounded, and with it every stack below. */
+
+static int metroi_range_is_cut(const metroi_range *range, const metroi_range *all)
+{
+    if (range->count > 4) return 1;
+    return range->count > 1 && metroi_box_area(&range->box) > metroi_box_area(&all->box) / 256;
+}
+
+typedef struct {
+    metroi_range range;
+    uint32_t fork;
+    int depth;
+} metroi_task;
+
+static int metroi_build_binary(metroi_builder *b, const metroi_range *all)
+{
+    metroi_task task[METROI_DEPTH + 2]; /* what waits: the right halves along one way down */
+    int tasks = 1;
+    if (!metroi_fork_add(b, all, &task[0].fork)) return 0;
+    task[0].range = *all;
+    task[0].depth = 0;
+    while (tasks > 0) {
+        metroi_task at = task[--tasks], *right = &task[tasks], *left = &task[tasks + 1];
+        metroi_split split = { 0, 0, 0, -1, 0, 0 };
+        if (!metroi_range_is_cut(&at.range, all)) continue;
+        if (at.depth < METROI_CUT_DEPTH) split = metroi_split_find(b->item, &at.range);
+        metroi_range_split(b->item, &at.range, &split, &left->range, &right->range);
+        left->depth = right->depth = at.depth + 1;
+        if (!metroi_fork_add(b, &left->range, &left->fork) || !metroi_fork_add(b, &right->range, &right->fork))
+            return 0;
+        b->fork[at.fork].left = left->fork;
+        b->fork[at.fork].right = right->fork;
+        tasks += 2;
+    }
+    return 1;
+}
+
+static void metroi_fork_share(const metroi_builder *b, metroi_fork *n, int i)
+{
+    const metroi_fork *left = &b->fork[n->left], *right = &b->fork[n->right];
+    int k;
+    n->cost[i] = 1e30f;
+    for (k = 1; k < i; k++) {
+        float cost = left->cost[k] + right->cost[i - k]; /* eq 10.4 */
+        if (cost < n->cost[i]) {
+            n->cost[i] = cost;
+            n->part[i] = (unsigned char)k;
+        }
+    }
+}
+
+static void metroi_fork_cost(const metroi_builder *b, metroi_fork *n)
+{
+    float area = metroi_box_area(&n->box);
+    int i;
+    for (i = 2; i <= METROI_WIDTH && n->left != 0; i++) metroi_fork_share(b, n, i);
+    n->cost[1] = n->count <= METROI_LEAF_MOST ? area * metroi_blocks_of(n->count) : 1e30f;
+    if (n->left != 0 && area + n->cost[METROI_WIDTH] < n->cost[1]) { /* eq 10.3 */
+        n->cost[1] = area + n->cost[METROI_WIDTH];
+        n->part[1] = 1;
+    }
+    for (i = 2; i < METROI_WIDTH; i++)
+        if (n->left == 0 || n->cost[i - 1] <= n->cost[i]) { /* eq 10.4 */
+            n->cost[i] = n->cost[i - 1];
+            n->part[i] = 0;
+        }
+}
+
+static int metroi_fork_is_leaf(const metroi_fork *fork)
+{
+    return fork->part[1] == 0;
+}
+
+/* Follows the choices down from fork n to the children of its node, in order; returns how many there are. */
+static int metroi_fork_children(const metroi_builder *b, uint32_t n, uint32_t child[METROI_WIDTH])
+{
+    uint32_t fork[METROI_WIDTH];
+    int room[METROI_WIDTH], top = 1, count = 0;
+    fork[0] = n;
+    room[0] = METROI_WIDTH;
+    while (top > 0) {
+        const metroi_fork *at = &b->fork[fork[--top]];
+        int i = room[top];
+        while (i > 1 && at->part[i] == 0) i--;
+        if (i == 1) child[count++] = fork[top];
+        else {
+            room[top] = i - at->part[i];
+            fork[top++] = at->right;
+            room[top] = at->part[i];
+            fork[top++] = at->left;
+        }
+    }
+    return count;
+}
+
+/* # 10.4 Into memory
+
+   A ray goes from a node to its children, so children of one node lie side by side, and what is below the first child
+   comes before what is below the second. Empty places in a node have a box that no ray meets, from +infinity to
+   -infinity, and empty places in a block have corners that are NaN, which fail every comparison. */
+
+static void metroi_node_set(metroi_node *node, int slot, const metroi_fork *fork, uint32_t child)
+{
+    int k;
+    for (k = 0; k < 3; k++) {
+        node->bound[k][slot] = fork != NULL ? fork->box.lo[k] : (float)METROI_INFINITY;
+        node->bound[k + 3][slot] = fork != NULL ? fork->box.hi[k] : -(float)METROI_INFINITY;
+    }
+    node->child[slot] = child;
+}
+
+static void metroi_block_set(const metroi_builder *b, metroi_block *block, int lane, uint32_t triangle)
+{
+    const float *corner = b->scene->corner;
+    int i;
+    for (i = 0; i < 9; i++) {
+        double x = triangle != METROI_NONE ? (double)corner[9 * (size_t)triangle + (size_t)i] : METROI_NAN;
+        block->corner[i / 3][i % 3][lane] = (float)(x * b->bvh->scale);
+    }
+    block->triangle[lane] = triangle;
+}
+
+/* A leaf as a child: its first block, shifted to make room for a bit that says whether there is a second. */
+static uint32_t metroi_leaf_place(const metroi_builder *b, const metroi_fork *leaf)
+{
+    metroi_bvh *bvh = b->bvh;
+    uint32_t first = (uint32_t)bvh->block_count, blocks = (leaf->count + 3) / 4, j;
+    bvh->block_count += blocks;
+    for (j = 0; j < 4 * blocks && bvh->blocks != NULL; j++) {
+        uint32_t triangle = j < leaf->count ? metroi_item_triangle(&b->item[leaf->first + j]) : METROI_NONE;
+        metroi_block_set(b, &bvh->blocks[first + j / 4], (int)(j % 4), triangle);
+    }
+    return METROI_LEAF | first << 1 | (blocks - 1);
+}
+
+/* Goes over the nodes, parents first, and places them and their leaves. It is run twice: without memory, to count
+   what is needed, and then with it. */
+static void metroi_build_wide(const metroi_builder *b)
+{
+    metroi_bvh *bvh = b->bvh;
+    metroi_fork *fork = b->fork;
+    uint32_t child[METROI_WIDTH];
+    size_t top = 1;
+    int i, count;
+    bvh->node_count = 1;
+    bvh->block_count = 0;
+    fork[0].waiting = fork[0].node = 0;
+    while (top > 0) {
+        metroi_fork *at = &fork[fork[--top].waiting];
+        count = metroi_fork_children(b, (uint32_t)(at - fork), child);
+        for (i = 0; i < METROI_WIDTH; i++) {
+            metroi_fork *c = i < count ? &fork[child[i]] : NULL;
+            uint32_t code = METROI_NONE;
+            if (c != NULL && metroi_fork_is_leaf(c)) code = metroi_leaf_place(b, c);
+            else if (c != NULL) code = c->node = (uint32_t)bvh->node_count++;
+            if (bvh->nodes != NULL) metroi_node_set(&bvh->nodes[at->node], i, c, code);
+        }
+        for (i = count - 1; i >= 0; i--)
+            if (!metroi_fork_is_leaf(&fork[child[i]])) fork[top++].waiting = child[i];
+    }
+}
+
+/* # 10.5 Building
+
+   Nodes and blocks begin on multiples of 64 bytes, the size of a line of the cache, so that a row of eight floats
+   never straddles two lines. `malloc` promises less, so we ask for a little more and begin inside. */
+
+static void *metroi_aligned(void *memory)
+{
+    unsigned char *bytes = (unsigned char *)memory;
+    return bytes + ((64 - ((uintptr_t)bytes & 63)) & 63);
+}
+
+static int metroi_bvh_allocate(metroi_bvh *bvh)
+{
+    size_t nodes, blocks;
+    if (!metroi_size_multiply(bvh->node_count, sizeof *bvh->nodes, &nodes) || nodes > SIZE_MAX - 64) return 0;
+    if (!metroi_size_multiply(bvh->block_count, sizeof *bvh->blocks, &blocks) || blocks > SIZE_MAX - 64) return 0;
+    bvh->node_memory = METRO_MALLOC(nodes + 64);
+    bvh->block_memory = METRO_MALLOC(blocks + 64);
+    if (bvh->node_memory == NULL || bvh->block_memory == NULL) return 0;
+    bvh->nodes = (metroi_node *)metroi_aligned(bvh->node_memory);
+    bvh->blocks = (metroi_block *)metroi_aligned(bvh->block_memory);
+    return 1;
+}
+
+static void metroi_bvh_free(metroi_bvh *bvh)
+{
+    if (bvh == NULL) return;
+    METRO_FREE(bvh->node_memory);
+    METRO_FREE(bvh->block_memory);
+    METRO_FREE(bvh);
+}
+
+/* The power of two above the largest finite coordinate. */
+static double metroi_scene_size(const metro_scene *scene)
+{
+    double largest = 0;
+    size_t i;
+    int exponent = 0;
+    for (i = 0; i < 9 * scene->triangle_count; i++) {
+        double x = fabs((double)scene->corner[i]);
+        if (x > largest && x < METROI_INFINITY) largest = x;
+    }
+    frexp(largest, &exponent);
+    return ldexp(1.0, exponent);
+}
+
+static void metroi_items_make(metroi_builder *b, metroi_range *all)
+{
+    const metro_scene *scene = b->scene;
+    size_t i;
+    metroi_range_clear(all, 0);
+    for (i = 0; i < scene->triangle_count; i++) {
+        metroi_item *item = &b->item[all->count];
+        if (metroi_item_make(scene->corner + 9 * i, b->bvh->scale, (uint32_t)i, item)) metroi_range_add(all, item);
+    }
+}
+
+/* All of it, with the memory for the forks that `b` then holds. */
+static int metroi_bvh_build(metroi_builder *b)
+{
+    metroi_range all;
+    size_t i;
+    metroi_items_make(b, &all);
+    if (all.count == 0) return 1;
+    b->fork_room = (size_t)all.count / 5 * 3 + 16;
+    if (!metroi_size_multiply(b->fork_room, sizeof *b->fork, &i)) return 0;
+    b->fork = (metroi_fork *)METRO_MALLOC(i);
+    if (b->fork == NULL || !metroi_build_binary(b, &all)) return 0;
+    for (i = b->fork_count; i > 0; i--) metroi_fork_cost(b, &b->fork[i - 1]);
+    metroi_build_wide(b);
+    if (!metroi_bvh_allocate(b->bvh)) return 0;
+    metroi_build_wide(b);
+    return 1;
+}
+
+static metroi_path metroi_path_best(void);
+
+METRO_API metro_result metro_scene_build(metro_scene *scene)
+{
+    metroi_builder b;
+    metro_result result = METRO_ERROR_MEMORY;
+    size_t size;
+    if (scene == NULL || scene->triangle_count >= (size_t)1 << 30) return METRO_ERROR_ARGUMENT;
+    if (scene->bvh != NULL) return METRO_OK;
+    if (!metroi_size_multiply(scene->triangle_count + 1, sizeof *b.item, &size)) return METRO_ERROR_MEMORY;
+    memset(&b, 0, sizeof b);
+    b.scene = scene;
+    b.item = (metroi_item *)METRO_MALLOC(size);
+    b.bvh = (metroi_bvh *)METRO_MALLOC(sizeof *b.bvh);
+    if (b.bvh != NULL) memset(b.bvh, 0, sizeof *b.bvh);
+    if (b.item != NULL && b.bvh != NULL) {
+        b.bvh->path = metroi_path_best();
+        b.bvh->size = metroi_scene_size(scene);
+        b.bvh->scale = 1 / b.bvh->size;
+        if (metroi_bvh_build(&b)) result = metroi_scene_lights(scene);
+    }
+    METRO_FREE(b.fork);
+    METRO_FREE(b.item);
+    if (result == METRO_OK) scene->bvh = b.bvh;
+    else metroi_bvh_free(b.bvh);
+    return result;
+}
+
+METRO_API void metro_scene_free(metro_scene *scene)
+{
+    if (scene == NULL) return;
+    METRO_FREE(scene->corner);
+    METRO_FREE(scene->material_of);
+    METRO_FREE(scene->material);
+    METRO_FREE(scene->light);
+    METRO_FREE(scene->light_sum);
+    metroi_bvh_free((metroi_bvh *)scene->bvh);
+    memset(scene, 0, sizeof *scene);
+}
+
+/* # 10.6 Rays and boxes
+
+   The tests below must give the same bits wherever they are compiled, or a ray slips through where one triangle
+   rounds this way and its neighbour that way. Compilers may join a product and a sum into one instruction that rounds
+   once, and do so for some products and not for others; here they must not. */
+
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
+#define METROI_ROUND_EACH
+#endif
+
+/* A ray comes with an origin and a direction in any units. We divide the origin by the scene's size and the direction
+   by its own largest component, which makes that component 1 or -1 and t a length in units of the scene. Multiplied
+   by `unit` it is the caller's t again. The bounds that the caller gave are compared as doubles, with the caller's t;
+   inside, bounds that are a little too wide save time and decide nothing. */
+
+typedef struct {
+    float origin[3], direction[3];
+    float inverse[3];             /* 1 / direction, perhaps infinite */
+    float reach[3], spare[3];     /* the same but finite; what 10.7 adds where it was infinite, else 0 */
+    size_t near_row[3], far_row[3]; /* the rows of metroi_node.bound, in floats, where the ray enters and leaves */
+    int axis[3];                  /* the last is the axis of the component 1 or -1, `side` */
+    float side, shear[2];
+    float t_min, t;               /* hits are looked for from t_min to t, which shrinks as they are found */
+    uint32_t triangle;            /* the nearest so far */
+    float det, v, w;              /* of it, as in 10.7 */
+    double start, unit;           /* the caller's t is (start + t) unit */
+    double least, most;           /* and lies between these */
+} metroi_ray;
+
+METROI_INLINE uint32_t metroi_float_bits(float x)
+{
+    uint32_t bits;
+    memcpy(&bits, &x, sizeof bits);
+    return bits;
+}
+
+METROI_INLINE double metroi_larger(double a, double b)
+{
+    return a > b ? a : b;
+}
+
+METROI_INLINE double metroi_largest(metro_vec3 a)
+{
+    return metroi_larger(metroi_larger(fabs(a.x), fabs(a.y)), fabs(a.z));
+}
+
+/* A box is the common part of three slabs, each between two planes. The ray is inside the slab of axis k between the
+   times at which it crosses the two planes, and inside the box when it is inside all three:
+
+       t_near = max_k frac{n_k - o_k}{d_k},    t_far = min_k frac{f_k - o_k}{d_k},    t_near <= t_far          (10.5)
+
+   with the plane $n_k$ that it meets first, the lower one where $d_k > 0$ (Kay and Kajiya 1986). The sign of 1/d
+   decides which, and knows it even for a component of -0.
+
+   A component that is 0 makes 1/d infinite. Beside the slab both quotients are the same infinity, inside they are
+   -infinity and infinity, both as they should be; and with the origin on a plane 0 times infinity is NaN, which says
+   that this plane has no opinion. So every minimum and maximum is written so that a NaN in the new number leaves the
+   old one.
+
+   Rounding may make the time of entrance too late and that of exit too early. A difference, an inverse and a product
+   round once each, by at most 6e-8, so if the later of the two is made longer by six times that, no box is missed
+   that the exact ray would hit (Ize 2013). That is 1.0000004; it is used in 10.7 for the box of a single triangle,
+   and boxes of nodes get twice as much, for the reason that is given there. */
+
+#define METROI_PAD 1.0000004f
+#define METROI_PAD_NODE 1.0000007f
+
+METROI_INLINE void metroi_ray_axis(metroi_ray *ray, size_t k, double origin, double direction)
+{
+    float inverse = 1.0f / (float)direction;
+    size_t upper = 24 * (size_t)(metroi_float_bits(inverse) >> 31); /* no branch: signs are random */
+    ray->origin[k] = (float)origin;
+    ray->direction[k] = (float)direction;
+    ray->inverse[k] = ray->reach[k] = inverse;
+    ray->spare[k] = 0;
+    ray->near_row[k] = 8 * k + upper;
+    ray->far_row[k] = 8 * k + (24 - upper);
+}
+
+/* Which axis comes last is computed without a branch, too. */
+METROI_INLINE void metroi_ray_directions(metroi_ray *ray, metro_vec3 d)
+{
+    static const int next[4] = { 1, 2, 0, 1 };
+    int y = fabs(d.y) > fabs(d.x), z = fabs(d.z) > metroi_larger(fabs(d.x), fabs(d.y));
+    int last = 2 * z + (y & (1 - z)), k;
+    ray->axis[0] = next[last];
+    ray->axis[1] = next[last + 1];
+    ray->axis[2] = last;
+    ray->side = ray->direction[last];
+    for (k = 0; k < 2; k++) ray->shear[k] = ray->direction[ray->axis[k]] * ray->side;
+    for (k = 0; k < 3; k++)
+        if (!(fabs((double)ray->inverse[k]) < 3e38)) {
+            ray->reach[k] = ray->inverse[k] > 0 ? 3e38f : -3e38f;
+            ray->spare[k] = 3e38f;
+        }
+}
+
+/* A ray that begins far away, or before t = 0, is moved along itself to a distance of about 2 from the middle of the
+   scene, which lies within sqrt(3) of it: floats would not tell far points apart. Returns 0 for one that passes
+   by. */
+static int metroi_ray_enter(metro_vec3 *o, metro_vec3 d, double t_min, double *start)
+{
+    double entrance = -metro_dot(*o, d) / metro_dot(d, d) - 2;
+    *start = metroi_larger(t_min, entrance);
+    *o = metro_add(*o, metro_scale(d, *start));
+    return metro_dot(*o, *o) < 64;
+}
+
+/* Returns 0 for a ray that hits nothing; a NaN makes the squares NaN, which are not below anything. `boost` brings
+   directions into the range where one over them is a number. */
+METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec3 d, double t_min, double t_max,
+                                  metroi_ray *ray)
+{
+    double largest = metroi_largest(d), inverse, unit, per_unit, low, high;
+    if (bvh == NULL || bvh->block_count == 0 || !(t_min < t_max)) return 0;
+    unit = bvh->size;
+    per_unit = bvh->scale;
+    if (!(largest > 1e-200 && largest < 1e200)) {
+        double boost = ldexp(1.0, largest < 1 ? 600 : -600);
+        d = metro_scale(d, boost);
+        largest *= boost;
+        unit *= boost;
+        per_unit /= boost;
+    }
+    inverse = 1 / largest;
+    d = metro_scale(d, inverse);
+    o = metro_scale(o, bvh->scale);
+    if (!(metro_dot(d, d) < 4)) return 0;
+    ray->unit = unit * inverse;
+    ray->least = t_min;
+    ray->most = t_max;
+    ray->start = 0;
+    low = t_min == 0 ? 0 : t_min * (largest * per_unit);
+    high = t_max < METROI_INFINITY ? t_max * (largest * per_unit) : t_max;
+    if (t_min < 0 || !(metro_dot(o, o) < 16)) {
+        if (!metroi_ray_enter(&o, d, low, &ray->start)) return 0;
+        low -= ray->start + 1e-15 * fabs(ray->start);
+        high -= ray->start - 1e-15 * fabs(ray->start);
+    }
+    if (!(low < 16 && high >= 0)) return 0; /* the scene ends before 16 */
+    ray->t_min = (float)(metroi_larger(low, 0) * (1 - 1e-6));
+    ray->t = high < 15 ? (float)(high * (1 + 1e-6)) : 16;
+    ray->triangle = METROI_NONE;
+    metroi_ray_axis(ray, 0, o.x, d.x);
+    metroi_ray_axis(ray, 1, o.y, d.y);
+    metroi_ray_axis(ray, 2, o.z, d.z);
+    metroi_ray_directions(ray, d);
+    return 1;
+}
+
+/* Tests the eight boxes of a node, writes when the ray enters each, and returns a bit for each that it meets. The
+   loops over eight are for compilers that make vector instructions of them. */
+METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_ray *ray, const void *spread,
+                                          float near_t[8])
+{
+    float far_t[8];
+    unsigned mask = 0;
+    int i, k;
+    (void)spread;
+    for (i = 0; i < 8; i++) near_t[i] = ray->t_min;
+    for (i = 0; i < 8; i++) far_t[i] = ray->t;
+    for (k = 0; k < 3; k++) { /* eq 10.5 */
+        const float *near_row = node->bound[0] + ray->near_row[k], *far_row = node->bound[0] + ray->far_row[k];
+        float o = ray->origin[k], r = ray->inverse[k], padded = ray->inverse[k] * METROI_PAD_NODE;
+        for (i = 0; i < 8; i++) near_t[i] = metroi_high((near_row[i] - o) * r, near_t[i]);
+        for (i = 0; i < 8; i++) far_t[i] = metroi_low((far_row[i] - o) * padded, far_t[i]);
+    }
+    for (i = 0; i < 8; i++) mask |= (unsigned)(near_t[i] <= far_t[i]) << i;
+    return mask;
+}
+
+/* # 10.7 Watertight triangles
+
+   Take the ray's origin as the origin of space, and shear space so that the ray runs along its main axis, the one of
+   the largest component of d, here called z. A corner p becomes
+
+       z_p = p_z - o_z,    x_p = p_x - o_x - s_x z_p,    y_p = p_y - o_y - s_y z_p,    s_x = d_x/d_z, s_y = d_y/d_z
+                                                                                              (10.6)
+
+   and the ray hits the triangle when the point (0, 0) lies in the flat triangle of the three (x, y). That is so when
+   it is on the same side of all three edges, which is told by the signs of
+
+       U = x_c y_b - y_c x_b,    V = x_a y_c - y_a x_c,    W = x_b y_a - y_b x_a                    (10.7)
+
+   These are twice the areas of the three triangles that (0, 0) makes with the edges, and so they also weigh the
+   corners:
+
+       t = frac{U z_a + V z_b + W z_c}{D d_z},    u = frac{V}{D},    v = frac{W}{D},    D = U + V + W       (10.8)
+
+   (Woop, Benthin and Wald 2013). Why does no ray get through between two triangles with a common edge? Both compute
+   the same x and y for the corners they share, from the same numbers by the same steps, so rounding moves the corners
+   but tears nothing apart. For the common edge both compute the same two products, and subtract them in opposite
+   order. Rounding is monotonic: the difference of two rounded products has the sign of the exact one or is 0. So the
+   two never both say "outside", and a 0, which counts as inside, is said by both. Here the products must be rounded
+   before they are subtracted; a fused instruction rounds one of them and not the other.
+
+   Three zeros at once come from a triangle seen edge-on, or from no area at all; then t is infinite or NaN and fails
+   the comparisons.
+
+   The order in which triangles are tested must not matter, or four boxes at once would give other pictures than
+   eight. It does matter if rounding puts the hit of a triangle before the box that holds the triangle: another hit in
+   between would end the search before that box is opened. So we hold every triangle to its own box: it is hit only if
+   the ray meets that box by eq 10.5, and not before t_near,
+
+       t <- max(t, t_near)                                                              (10.9)
+
+   A box around this box has its planes farther out, and rounding is monotonic, so its t_near is not larger, and its
+   t_far not smaller: hence its larger pad, for which the corner is multiplied by a rounded product instead of being
+   padded last. A box on the way to an accepted triangle is therefore never left out, whatever else was found, and the
+   nearest hit, of equal ones that of the lowest number, is the same for every tree and every order. The tests compare
+   it, bit by bit, with a loop over all triangles.
+
+   For a component of d that is 0 a comparison with the triangle's own slab says no more than eq 10.7 does exactly,
+   and `spare` makes it pass. */
+
+typedef struct {
+    float t[4], v[4], w[4], det[4];
+} metroi_lanes;
+
+/* The times at which the ray enters and leaves the box of one triangle. */
+METROI_INLINE void metroi_own_box(const metroi_block *block, int i, const metroi_ray *ray, float *near_t,
+                                  float *far_t)
+{
+    int j;
+    *near_t = ray->t_min;
+    *far_t = ray->t;
+    for (j = 0; j < 3; j++) { /* eq 10.5 */
+        int k = ray->axis[j];
+        float a = (block->corner[0][k][i] - ray->origin[k]) * ray->reach[k];
+        float b = (block->corner[1][k][i] - ray->origin[k]) * ray->reach[k];
+        float c = (block->corner[2][k][i] - ray->origin[k]) * ray->reach[k];
+        float last = metroi_high(metroi_high(a, b), c) * METROI_PAD;
+        *near_t = metroi_high(metroi_low(metroi_low(a, b), c), *near_t);
+        *far_t = metroi_low(last + ray->spare[k], *far_t);
+    }
+}
+
+/* Tests the four triangles of a block, and returns a bit for each that is hit between t_min and t. */
+METROI_INLINE unsigned metroi_block_plain(const metroi_block *block, const metroi_ray *ray, const void *spread,
+                                          metroi_lanes *lanes)
+{
+    int kx = ray->axis[0], ky = ray->axis[1], kz = ray->axis[2], i, j;
+    unsigned mask = 0;
+    (void)spread;
+    for (i = 0; i < 4; i++) {
+        float x[3], y[3], z[3], U, V, W, T, t, near_t, far_t;
+        for (j = 0; j < 3; j++) { /* eq 10.6 */
+            z[j] = block->corner[j][kz][i] - ray->origin[kz];
+            x[j] = (block->corner[j][kx][i] - ray->origin[kx]) - ray->shear[0] * z[j];
+            y[j] = (block->corner[j][ky][i] - ray->origin[ky]) - ray->shear[1] * z[j];
+        }
+        U = x[2] * y[1] - y[2] * x[1]; /* eq 10.7 */
+        V = x[0] * y[2] - y[0] * x[2];
+        W = x[1] * y[0] - y[1] * x[0];
+        if (!((U >= 0 && V >= 0 && W >= 0) || (U <= 0 && V <= 0 && W <= 0))) continue;
+        T = ((U * z[0] + V * z[1]) + W * z[2]) * ray->side;
+        t = T / ((U + V) + W); /* eq 10.8: 1/d_z is d_z, 1 or -1 */
+        if (!(t >= ray->t_min && t <= ray->t)) continue;
+        metroi_own_box(block, i, ray, &near_t, &far_t);
+        if (!(near_t <= far_t)) continue;
+        lanes->t[i] = metroi_high(t, near_t); /* eq 10.9 */
+        lanes->v[i] = V;
+        lanes->w[i] = W;
+        lanes->det[i] = (U + V) + W;
+        mask |= 1u << i;
+    }
+    return mask;
+}
+
+METROI_INLINE int metroi_lowest_bit(unsigned mask)
+{
+#if defined(__GNUC__) || defined(__clang__)
+    return __builtin_ctz(mask);
+#else
+    int bit = 0;
+    while ((mask >> bit & 1) == 0) bit++;
+    return bit;
+#endif
+}
+
+/* Takes the nearest of the hits in a block, if it is nearer than what the ray has. */
+METROI_INLINE void metroi_ray_take(metroi_ray *ray, const metroi_block *block, const metroi_lanes *lanes,
+                                   unsigned mask)
+{
+    do {
+        int i = metroi_lowest_bit(mask);
+        float t = lanes->t[i];
+        double user = (ray->start + (double)t) * ray->unit;
+        mask &= mask - 1;
+        if (!(t < ray->t || (t == ray->t && block->triangle[i] < ray->triangle))) continue;
+        if (!(user > ray->least && user < ray->most)) continue;
+        ray->t = t;
+        ray->v = lanes->v[i];
+        ray->w = lanes->w[i];
+        ray->det = lanes->det[i];
+        ray->triangle = block->triangle[i];
+    } while (mask != 0);
+}
+
+/* # 10.8 Four and eight at once
+
+   Processors have instructions that do the same to four or eight floats. The wrapper gives one name to those of SSE2,
+   which every 64-bit PC has, and of NEON, which every 64-bit ARM has; elsewhere, or with METRO_NO_SIMD defined, the
+   plain functions above do the work. The functions below are the same tests with the same operations in the same
+   order. Minimum and maximum keep the second number when one is NaN. */
+
+#if !defined(METRO_NO_SIMD) && defined(__GNUC__) && !defined(__TINYC__) && defined(__SSE2__)
+#define METROI_SIMD
+#define METROI_AVX2 __attribute__((target("avx2,bmi,fma")))
+#include <immintrin.h>
+
+typedef __m128 metroi_v4;
+METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return _mm_loadu_ps(p); }
+METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { _mm_storeu_ps(p, a); }
+METROI_INLINE metroi_v4 metroi_v4_all(float x) { return _mm_set1_ps(x); }
+METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return _mm_add_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return _mm_sub_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return _mm_mul_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return _mm_div_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return _mm_min_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return _mm_max_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return _mm_cmple_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b) { return _mm_and_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b) { return _mm_or_ps(a, b); }
+METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a) { return (unsigned)_mm_movemask_ps(a); }
+
+#elif !defined(METRO_NO_SIMD) && defined(__GNUC__) && defined(__aarch64__) && defined(__ARM_NEON)
+#define METROI_SIMD
+#include <arm_neon.h>
+
+typedef float32x4_t metroi_v4;
+METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return vld1q_f32(p); }
+METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { vst1q_f32(p, a); }
+METROI_INLINE metroi_v4 metroi_v4_all(float x) { return vdupq_n_f32(x); }
+METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return vaddq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return vsubq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return vmulq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return vdivq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
+METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
+METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return vreinterpretq_f32_u32(vcleq_f32(a, b)); }
+METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b)
+{
+    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
+}
+METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b)
+{
+    return vreinterpretq_f32_u32(vorrq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
+}
+METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a)
+{
+    static const uint32_t bit[4] = { 1, 2, 4, 8 };
+    return vaddvq_u32(vandq_u32(vreinterpretq_u32_f32(a), vld1q_u32(bit)));
+}
+#endif
+
+#ifdef METROI_SIMD
+/* The ray's numbers in all four lanes, spread once a ray. `row` is where a triangle's x, y, z are in a block. */
+typedef struct {
+    metroi_v4 origin[3], inverse[3], padded[3]; /* for boxes */
+    metroi_v4 start[3], shear[2], side;         /* for triangles, in the order of `axis` */
+    metroi_v4 reach[3], spare[3];
+    size_t near_row[3], far_row[3], row[3];
+} metroi_ray4;
+
+METROI_INLINE void metroi_ray4_axis(const metroi_ray *ray, int k, metroi_ray4 *s)
+{
+    int axis = ray->axis[k];
+    s->origin[k] = metroi_v4_all(ray->origin[k]);
+    s->inverse[k] = metroi_v4_all(ray->inverse[k]);
+    s->padded[k] = metroi_v4_all(ray->inverse[k] * METROI_PAD_NODE);
+    s->start[k] = metroi_v4_all(ray->origin[axis]);
+    s->reach[k] = metroi_v4_all(ray->reach[axis]);
+    s->spare[k] = metroi_v4_all(ray->spare[axis]);
+    s->near_row[k] = ray->near_row[k];
+    s->far_row[k] = ray->far_row[k];
+    s->row[k] = 4 * (size_t)axis;
+}
+
+METROI_INLINE void metroi_ray4_make(const metroi_ray *ray, metroi_ray4 *s)
+{
+    metroi_ray4_axis(ray, 0, s);
+    metroi_ray4_axis(ray, 1, s);
+    metroi_ray4_axis(ray, 2, s);
+    s->shear[0] = metroi_v4_all(ray->shear[0]);
+    s->shear[1] = metroi_v4_all(ray->shear[1]);
+    s->side = metroi_v4_all(ray->side);
+}
+
+METROI_INLINE metroi_v4 metroi_v4_plane(const float *row, metroi_v4 origin, metroi_v4 inverse)
+{
+    return metroi_v4_mul(metroi_v4_sub(metroi_v4_load(row), origin), inverse);
+}
+
+METROI_INLINE unsigned metroi_boxes_half(const float *row, const metroi_ray *ray, const metroi_ray4 *s, float *near_t)
+{
+    metroi_v4 n = metroi_v4_all(ray->t_min), f = metroi_v4_all(ray->t); /* eq 10.5 */
+    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[0], s->origin[0], s->inverse[0]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[0], s->origin[0], s->padded[0]), f);
+    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[1], s->origin[1], s->inverse[1]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[1], s->origin[1], s->padded[1]), f);
+    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[2], s->origin[2], s->inverse[2]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[2], s->origin[2], s->padded[2]), f);
+    metroi_v4_store(near_t, n);
+    return metroi_v4_mask(metroi_v4_le(n, f));
+}
+
+METROI_INLINE unsigned metroi_boxes_four(const metroi_node *node, const metroi_ray *ray, const void *spread,
+                                         float near_t[8])
+{
+    const metroi_ray4 *s = (const metroi_ray4 *)spread;
+    unsigned first = metroi_boxes_half(node->bound[0], ray, s, near_t);
+    return first | metroi_boxes_half(node->bound[0] + 4, ray, s, near_t + 4) << 4;
+}
+
+METROI_INLINE metroi_v4 metroi_v4_shear(const float *row, metroi_v4 origin, metroi_v4 shear, metroi_v4 z)
+{
+    return metroi_v4_sub(metroi_v4_sub(metroi_v4_load(row), origin), metroi_v4_mul(shear, z)); /* eq 10.6 */
+}
+
+METROI_INLINE metroi_v4 metroi_v4_edge(metroi_v4 px, metroi_v4 py, metroi_v4 qx, metroi_v4 qy)
+{
+    return metroi_v4_sub(metroi_v4_mul(qx, py), metroi_v4_mul(qy, px)); /* eq 10.7 */
+}
+
+METROI_INLINE void metroi_v4_own_slab(const float *row, const metroi_ray4 *s, int k, metroi_v4 *n, metroi_v4 *f)
+{
+    metroi_v4 a = metroi_v4_plane(row + s->row[k], s->start[k], s->reach[k]);
+    metroi_v4 b = metroi_v4_plane(row + s->row[k] + 12, s->start[k], s->reach[k]);
+    metroi_v4 c = metroi_v4_plane(row + s->row[k] + 24, s->start[k], s->reach[k]);
+    metroi_v4 last = metroi_v4_mul(metroi_v4_high(metroi_v4_high(a, b), c), metroi_v4_all(METROI_PAD));
+    *n = metroi_v4_high(metroi_v4_low(metroi_v4_low(a, b), c), *n);
+    *f = metroi_v4_low(metroi_v4_add(last, s->spare[k]), *f);
+}
+
+METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi_ray *ray, const void *spread,
+                                         metroi_lanes *lanes)
+{
+    const metroi_ray4 *s = (const metroi_ray4 *)spread;
+    const float *row = block->corner[0][0], *px = row + s->row[0], *py = row + s->row[1], *pz = row + s->row[2];
+    metroi_v4 az = metroi_v4_sub(metroi_v4_load(pz), s->start[2]);
+    metroi_v4 bz = metroi_v4_sub(metroi_v4_load(pz + 12), s->start[2]);
+    metroi_v4 cz = metroi_v4_sub(metroi_v4_load(pz + 24), s->start[2]);
+    metroi_v4 ax = metroi_v4_shear(px, s->start[0], s->shear[0], az);
+    metroi_v4 ay = metroi_v4_shear(py, s->start[1], s->shear[1], az);
+    metroi_v4 bx = metroi_v4_shear(px + 12, s->start[0], s->shear[0], bz);
+    metroi_v4 by = metroi_v4_shear(py + 12, s->start[1], s->shear[1], bz);
+    metroi_v4 cx = metroi_v4_shear(px + 24, s->start[0], s->shear[0], cz);
+    metroi_v4 cy = metroi_v4_shear(py + 24, s->start[1], s->shear[1], cz);
+    metroi_v4 U = metroi_v4_edge(bx, by, cx, cy), V = metroi_v4_edge(cx, cy, ax, ay);
+    metroi_v4 W = metroi_v4_edge(ax, ay, bx, by), det = metroi_v4_add(metroi_v4_add(U, V), W), T, t, in;
+    metroi_v4 zero = metroi_v4_all(0), n = metroi_v4_all(ray->t_min), f = metroi_v4_all(ray->t);
+    in = metroi_v4_or(metroi_v4_le(zero, metroi_v4_low(metroi_v4_low(U, V), W)),
+                      metroi_v4_le(metroi_v4_high(metroi_v4_high(U, V), W), zero));
+    T = metroi_v4_add(metroi_v4_add(metroi_v4_mul(U, az), metroi_v4_mul(V, bz)), metroi_v4_mul(W, cz));
+    t = metroi_v4_div(metroi_v4_mul(T, s->side), det); /* eq 10.8 */
+    in = metroi_v4_and(in, metroi_v4_and(metroi_v4_le(n, t), metroi_v4_le(t, f)));
+    if (metroi_v4_mask(in) == 0) return 0;
+    metroi_v4_own_slab(row, s, 0, &n, &f);
+    metroi_v4_own_slab(row, s, 1, &n, &f);
+    metroi_v4_own_slab(row, s, 2, &n, &f);
+    metroi_v4_store(lanes->t, metroi_v4_high(t, n)); /* eq 10.9 */
+    metroi_v4_store(lanes->v, V);
+    metroi_v4_store(lanes->w, W);
+    metroi_v4_store(lanes->det, det);
+    return metroi_v4_mask(metroi_v4_and(in, metroi_v4_le(n, f)));
+}
+#endif
+
+/* With AVX2 the eight boxes of a node are one instruction at a time, which saves a tenth of the time. The program
+   asks the processor when it runs, so nothing is asked of the compiler's options: the attribute permits the
+   instructions in one function.
+
+   A box need not be tested in the order of 10.6: it only must not be missed where 10.7 would accept a triangle in it.
+   So here the product and the difference of eq 10.5 are one fused instruction,
+
+       t_near = max_k (n_k r_k - (o_k r_k + m_k)),    t_far = min_k (f_k r_k - (o_k r_k - m_k))             (10.10)
+
+   with $r_k = 1/d_k$, and its subtrahends are computed once a ray. The margin $m_k$ covers what rounding does: the
+   product $o_k r_k$ and the sums are off by 2^-24 of themselves, and times up to 16 differ between the two forms by
+   16 times 7e-7, the larger of the two pads. Infinities would turn to NaN here, so $r_k$ is at most 1e30; and 2.4e-7
+   of it in the margin keeps every box that is within that distance of a ray which runs along a plane. */
+
+#ifdef METROI_AVX2
+typedef struct {
+    metroi_ray4 four;
+    __m256 inverse[3], enter[3], leave[3];
+} metroi_ray8;
+
+METROI_AVX2 METROI_INLINE void metroi_ray8_axis(const metroi_ray *ray, int k, metroi_ray8 *s)
+{
+    float r = metroi_low(metroi_high(ray->inverse[k], -1e30f), 1e30f), shift = ray->origin[k] * r;
+    float margin = (fabsf(shift) + fabsf(r)) * 2.4e-7f + 1.5e-5f;
+    s->inverse[k] = _mm256_set1_ps(r);
+    s->enter[k] = _mm256_set1_ps(shift + margin);
+    s->leave[k] = _mm256_set1_ps(shift - margin);
+}
+
+METROI_AVX2 METROI_INLINE __m256 metroi_v8_plane(const float *row, __m256 inverse, __m256 shift)
+{
+    return _mm256_fmsub_ps(_mm256_loadu_ps(row), inverse, shift);
+}
+
+METROI_AVX2 METROI_INLINE unsigned metroi_boxes_eight(const metroi_node *node, const metroi_ray *ray,
+                                                      const void *spread, float near_t[8])
+{
+    const metroi_ray8 *s = (const metroi_ray8 *)spread;
+    const size_t *near_row = s->four.near_row, *far_row = s->four.far_row;
+    const float *row = node->bound[0];
+    __m256 n = _mm256_set1_ps(ray->t_min), f = _mm256_set1_ps(ray->t); /* eq 10.10 */
+    n = _mm256_max_ps(metroi_v8_plane(row + near_row[0], s->inverse[0], s->enter[0]), n);
+    f = _mm256_min_ps(metroi_v8_plane(row + far_row[0], s->inverse[0], s->leave[0]), f);
+    n = _mm256_max_ps(metroi_v8_plane(row + near_row[1], s->inverse[1], s->enter[1]), n);
+    f = _mm256_min_ps(metroi_v8_plane(row + far_row[1], s->inverse[1], s->leave[1]), f);
+    n = _mm256_max_ps(metroi_v8_plane(row + near_row[2], s->inverse[2], s->enter[2]), n);
+    f = _mm256_min_ps(metroi_v8_plane(row + far_row[2], s->inverse[2], s->leave[2]), f);
+    _mm256_storeu_ps(near_t, n);
+    return (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(n, f, _CMP_LE_OQ));
+}
+#endif
+
+/* # 10.9 The walk
+
+   From the root down, the ray goes to the nearest child that it meets and leaves the others on a stack, the nearest
+   on top. When it has come to a leaf, or to a node none of whose children it meets, it takes the top of the stack, if
+   that box does not begin behind the nearest hit so far. To know whether anything at all is hit, the first hit will
+   do, and the order is of no concern.
+
+   What waits is one number of 64 bits, the time of entrance above and the child below: times are not negative, and
+   then the bits of floats are ordered as the floats are. Exchanging two such numbers needs no branch. Most nodes that
+   are met have one or two children that are met, so up to four are sorted by a fixed list of exchanges and the rest
+   by insertion.
+
+   The depth of a tree is at most 72 (10.3) and a node leaves at most seven children, which bounds the stack. */
+
+enum { METROI_STACK = 7 * METROI_DEPTH + 8 };
+
+METROI_INLINE uint64_t metroi_waiting_next(const uint32_t *child, const float *near_t, unsigned *mask)
+{
+    int i = metroi_lowest_bit(*mask);
+    *mask &= *mask - 1;
+    return (uint64_t)metroi_float_bits(near_t[i]) << 32 | child[i];
+}
+
+METROI_INLINE void metroi_exchange(uint64_t *far_one, uint64_t *near_one)
+{
+    uint64_t a = *far_one, b = *near_one;
+    *far_one = a > b ? a : b;
+    *near_one = a > b ? b : a;
+}
+
+/* Puts all children in `mask`, of which there are at least two, on the stack in order, but the nearest, which it
+   returns. */
+METROI_INLINE uint32_t metroi_children_sort(const uint32_t *child, const float *near_t, unsigned mask,
+                                            uint64_t *stack, int *top)
+{
+    uint64_t *base = stack + *top, *end = base, a, b, c, d;
+    a = metroi_waiting_next(child, near_t, &mask);
+    b = metroi_waiting_next(child, near_t, &mask);
+    metroi_exchange(&a, &b);
+    *end++ = a;
+    if (mask != 0) {
+        c = metroi_waiting_next(child, near_t, &mask);
+        metroi_exchange(&b, &c);
+        metroi_exchange(&a, &b);
+        end[-1] = a;
+        *end++ = b;
+        b = c;
+        if (mask != 0) {
+            d = metroi_waiting_next(child, near_t, &mask);
+            metroi_exchange(&c, &d);
+            metroi_exchange(&end[-1], &c);
+            metroi_exchange(&end[-2], &end[-1]);
+            *end++ = c;
+            b = d;
+        }
+    }
+    while (mask != 0) {
+        uint64_t *at = end++;
+        a = metroi_waiting_next(child, near_t, &mask);
+        metroi_exchange(&a, &b);
+        for (; at > base && at[-1] < a; at--) at[0] = at[-1];
+        at[0] = a;
+    }
+    *top = (int)(end - stack);
+    return (uint32_t)b;
+}
+
+typedef unsigned (*metroi_boxes_test)(const metroi_node *node, const metroi_ray *ray, const void *spread,
+                                      float near_t[8]);
+typedef unsigned (*metroi_block_test)(const metroi_block *block, const metroi_ray *ray, const void *spread,
+                                      metroi_lanes *lanes);
+
+/* The two tests are arguments that are known where this is inlined, so that they are inlined in turn: one walk stands
+   for all. `any` asks for any hit. */
+METROI_INLINE void metroi_walk(const metroi_bvh *bvh, metroi_ray *ray, int any, metroi_boxes_test boxes,
+                               metroi_block_test triangles, const void *spread)
+{
+    METROI_ALIGNED float near_t[8]; /* one store, which must not straddle two lines of the cache */
+    METROI_ALIGNED metroi_lanes lanes;
+    uint64_t stack[METROI_STACK];
+    uint32_t at = 0;
+    int top = 0;
+    for (;;) {
+        unsigned mask = 1;
+        while (!(at & METROI_LEAF)) {
+            const metroi_node *node = bvh->nodes + at;
+            mask = boxes(node, ray, spread, near_t);
+            if (mask == 0) break;
+            at = node->child[metroi_lowest_bit(mask)];
+            if ((mask & (mask - 1)) == 0) continue;
+            if (!any) at = metroi_children_sort(node->child, near_t, mask, stack, &top);
+            else while ((mask &= mask - 1) != 0) stack[top++] = node->child[metroi_lowest_bit(mask)];
+        }
+        if (at & METROI_LEAF) {
+            const metroi_block *block = bvh->blocks + ((at & ~METROI_LEAF) >> 1), *end = block + 1 + (at & 1);
+            for (; block < end; block++) {
+                mask = triangles(block, ray, spread, &lanes);
+                if (mask != 0) metroi_ray_take(ray, block, &lanes, mask);
+                if (any && ray->triangle != METROI_NONE) return;
+            }
+        }
+        do {
+            if (top == 0) return;
+            top--;
+        } while (!any && stack[top] >> 32 > metroi_float_bits(ray->t));
+        at = (uint32_t)(stack[top] & METROI_NONE);
+    }
+}
+
+static void metroi_walk_plain(const metroi_bvh *bvh, metroi_ray *ray, int any)
+{
+    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_plain, metroi_block_plain, NULL);
+    else metroi_walk(bvh, ray, 0, metroi_boxes_plain, metroi_block_plain, NULL);
+}
+
+#ifdef METROI_SIMD
+static void metroi_walk_four(const metroi_bvh *bvh, metroi_ray *ray, int any)
+{
+    metroi_ray4 spread;
+    metroi_ray4_make(ray, &spread);
+    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_four, metroi_block_four, &spread);
+    else metroi_walk(bvh, ray, 0, metroi_boxes_four, metroi_block_four, &spread);
+}
+#endif
+
+#ifdef METROI_AVX2
+METROI_AVX2 static void metroi_walk_eight(const metroi_bvh *bvh, metroi_ray *ray, int any)
+{
+    metroi_ray8 spread;
+    metroi_ray4_make(ray, &spread.four);
+    metroi_ray8_axis(ray, 0, &spread);
+    metroi_ray8_axis(ray, 1, &spread);
+    metroi_ray8_axis(ray, 2, &spread);
+    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_eight, metroi_block_four, &spread.four);
+    else metroi_walk(bvh, ray, 0, metroi_boxes_eight, metroi_block_four, &spread.four);
+}
+#endif
+
+static void metroi_walk_best(const metroi_bvh *bvh, metroi_ray *ray, int any)
+{
+#ifdef METROI_AVX2
+    if (bvh->path == METROI_EIGHT) {
+        metroi_walk_eight(bvh, ray, any);
+        return;
+    }
+#endif
+#ifdef METROI_SIMD
+    if (bvh->path != METROI_PLAIN) {
+        metroi_walk_four(bvh, ray, any);
+        return;
+    }
+#endif
+    metroi_walk_plain(bvh, ray, any);
+}
+
+static metroi_path metroi_path_best(void)
+{
+#ifdef METROI_AVX2
+    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("bmi") && __builtin_cpu_supports("fma"))
+        return METROI_EIGHT;
+#endif
+#ifdef METROI_SIMD
+    return METROI_FOUR;
+#else
+    return METROI_PLAIN;
+#endif
+}
+
+METRO_API int metro_scene_hit(const metro_scene *scene, metro_vec3 origin, metro_vec3 direction, double t_min,
+                              double t_max, metro_hit *hit)
+{
+    const metroi_bvh *bvh = (const metroi_bvh *)scene->bvh;
+    metroi_ray ray;
+    if (!metroi_ray_make(bvh, origin, direction, t_min, t_max, &ray)) return 0;
+    metroi_walk_best(bvh, &ray, 0);
+    if (ray.triangle == METROI_NONE) return 0;
+    hit->t = (ray.start + (double)ray.t) * ray.unit;
+    hit->u = (double)(ray.v / ray.det); /* eq 10.8 */
+    hit->v = (double)(ray.w / ray.det);
+    hit->triangle = ray.triangle;
+    return 1;
+}
+
+METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, metro_vec3 direction, double t_min,
+                                   double t_max)
+{
+    const metroi_bvh *bvh = (const metroi_bvh *)scene->bvh;
+    metroi_ray ray;
+    if (!metroi_ray_make(bvh, origin, direction, t_min, t_max, &ray)) return 0;
+    metroi_walk_best(bvh, &ray, 1);
+    return ray.triangle != METROI_NONE;
+}
+
+/* # 10.10 Leaving a surface
+
+   A path goes on from the point where it hit, and must not hit that triangle again because of a rounding. The usual
+   cure, to start at t = 0.001 or so, is too much for a small scene and too little for a large one. We look at what is
+   rounded instead. Let e = 2^-24, what a float rounds off, and let a ray start at o near a triangle, all of whose
+   corners lie within L of o along each axis. In eq 10.6 a corner is rounded three times and in the sum of eq 10.8
+   four times, each time by at most e L; so the test sees the triangle's plane displaced by at most about 8 e L along
+   each axis, 14 e L at an angle. The weights U, V and W are rounded by up to 2 e L^2, each on its own. That is
+   nothing beside their sum when the triangle is as wide as it is long; but of a needle, whose width w is its doubled
+   area over L, the sum is L w at most, and the hit moves by 2 e L/w of the length L. Starting higher than both above
+   the plane, and going away from it, the ray does not meet it. How flat it leaves does not matter, since a height is
+   compared with a height.
+
+   The start is rounded to floats as well, which moves it by up to $e abs(p_k)$ along axis k, and towards the plane by
+   the share $abs(n_k)$ of that. So the height is
+
+       h = 16 e L + min(w, 4 e L frac{L}{w}) + 2 e sum_k abs(n_k p_k)                    (10.11)
+
+   on the side of the triangle that the direction points to; a needle is not left by more than its width. A floor at y
+   = 0 of triangles 10 long gives a height of about 1e-5, and a contact shadow begins that near to the contact; far
+   from the origin of coordinates it is the spacing of the floats that decides, as it must.
+
+   In a corner of a room that rounding may carry the start sideways through the other wall. So the point first moves a
+   little towards the middle of its triangle, by as much as its coordinates may be rounded. */
+
+static metro_vec3 metroi_scene_leave(const metro_scene *scene, uint32_t triangle, metro_vec3 point,
+                                     metro_vec3 direction)
+{
+    const double e = 1.0 / 16777216;
+    metro_vec3 p[3], n = metroi_triangle_cross(scene, triangle), inward;
+    double area = metro_length(n), extent = 0, width, height, shrink;
+    int k;
+    if (!(area > 0)) return point; /* no area, no side */
+    n = metro_scale(n, 1 / area);
+    metroi_triangle_corners(scene, triangle, p);
+    for (k = 0; k < 3; k++) extent = metroi_larger(extent, metroi_largest(metro_subtract(p[k], point)));
+    width = area / extent;
+    height = 16 * e * extent + fmin(width, 4 * e * extent * extent / width); /* eq 10.11 */
+    height += 2 * e * (fabs(n.x * point.x) + fabs(n.y * point.y) + fabs(n.z * point.z));
+    if (metro_dot(n, direction) < 0) height = -height;
+    inward = metro_subtract(metro_scale(metro_add(metro_add(p[0], p[1]), p[2]), 1.0 / 3), point);
+    shrink = 4 * e * (1 + metroi_largest(point) / extent);
+    point = metro_add(point, metro_scale(inward, shrink < 0.5 ? shrink : 0.5));
+    point = metro_add(point, metro_scale(n, height));
+    return metro_vec3_make((double)(float)point.x, (double)(float)point.y, (double)(float)point.z);
+}
+
+#ifdef METROI_ROUND_EACH
+#pragma GCC pop_options
+#undef METROI_ROUND_EACH
+#elif defined(__clang__)
+#pragma STDC FP_CONTRACT DEFAULT
+#endif
+#undef METROI_INLINE
+#undef METROI_ALIGNED
+#undef METROI_LEAF
+#undef METROI_NONE
+#undef METROI_PAD
+#undef METROI_PAD_NODE
+#undef METROI_AVX2
+#undef METROI_SIMD
+
+/* # 11 Light
+
+   Three models are all that the scenes of the paper need: a surface that reflects a part of the light in all
+   directions and a part around the mirror direction, a lamp that is a triangle which glows evenly, and a camera that
+   is a pinhole. Each is used in two ways: to say how much light goes from here to there, and to draw a direction, or
+   a point, where much light goes. */
+
+/* # 11.1 Surfaces
+
+   The BRDF is the sum of a diffuse and a glossy lobe (Phong's, normalised by Lafortune and Willems 1994):
+
+       f(i, o) = frac{k_d}{pi} + k_s frac{n + 2}{2 pi} max(0, cos(a))^n               (11.1)
+
+   where a is the angle between i and the mirror image of o about the normal. It is symmetric, and with k_d + k_s <= 1
+   it sends out no more than it receives: the factor n + 2, rather than n + 1, makes the glossy lobe reflect k_s when
+   the light falls on it perpendicularly, and less at grazing angles, where a part of the lobe is below the surface.
+
+   A direction is drawn from the diffuse lobe with probability q, the share of k_d in k_d + k_s, and from the glossy
+   lobe otherwise. Together the density per steradian is
+
+       p(i) = q frac{cos(theta_i)}{pi} + (1 - q) frac{n + 1}{2 pi} max(0, cos(a))^n            (11.2)
+
+   What eqs 11.1 and 11.2 share is computed once a material. */
+
+typedef struct {
+    metro_vec3 diffuse;      /* k_d / pi */
+    metro_vec3 glossy;       /* k_s (n + 2)/(2 pi) */
+    metro_vec3 emission;
+    double exponent;         /* n */
+    double share;            /* q; 1 where nothing is glossy */
+    double lobe;             /* (n + 1)/(2 pi) */
+    int black;               /* reflects nothing */
+} metroi_surface;
+
+static double metroi_color_sum(metro_vec3 color)
+{
+    return color.x + color.y + color.z;
+}
+
+static metroi_surface metroi_surface_make(const metro_material *material)
+{
+    metroi_surface surface;
+    double diffuse = metroi_color_sum(material->kd), glossy = metroi_color_sum(material->ks);
+    surface.diffuse = metro_scale(material->kd, 1 / METROI_PI);
+    surface.glossy = metro_scale(material->ks, (material->ns + 2) / (2 * METROI_PI));
+    surface.emission = material->ke;
+    surface.exponent = material->ns;
+    surface.share = glossy > 0 ? diffuse / (diffuse + glossy) : 1;
+    surface.lobe = (material->ns + 1) / (2 * METROI_PI);
+    surface.black = !(diffuse + glossy > 0);
+    return surface;
+}
+
+/* The value of the BRDF and its two densities, of i for o and of o for i: the glossy part serves all three. With the
+   cosines $c_i = n i$ and $c_o = n o$ that of the angle to the mirror direction is $2 c_i c_o - i o$. */
+
+typedef struct {
+    metro_vec3 value;
+    double density, reverse; /* of drawing `in` for `out`, and `out` for `in` */
+} metroi_scatter;
+
+static inline metroi_scatter metroi_surface_scatter(const metroi_surface *surface, metro_vec3 normal, metro_vec3 in,
+                                             metro_vec3 out)
+{
+    double cos_in = metro_dot(normal, in), cos_out = metro_dot(normal, out);
+    metroi_scatter s;
+    s.value = metro_vec3_make(0, 0, 0);
+    s.density = s.reverse = 0;
+    if (!(cos_in > 0) || !(cos_out > 0)) return s;
+    s.value = surface->diffuse;
+    s.density = surface->share * cos_in / METROI_PI;
+    s.reverse = surface->share * cos_out / METROI_PI;
+    if (surface->share < 1) {
+        double mirror = 2 * cos_in * cos_out - metro_dot(in, out);
+        double lobe = mirror > 0 ? pow(mirror < 1 ? mirror : 1, surface->exponent) : 0;
+        double density = (1 - surface->share) * surface->lobe * lobe;
+        s.value = metro_add(s.value, metro_scale(surface->glossy, lobe)); /* eq 11.1 */
+        s.density += density;                                             /* eq 11.2 */
+        s.reverse += density;
+    }
+    return s;
+}
+
+/* A direction at the height `z` above the plane of `axis`, at the given azimuth, in the frame of section 3.9. */
+
+static inline metro_vec3 metroi_direction_at(metro_vec3 axis, double z, double turn)
+{
+    double sign = axis.z < 0 ? -1 : 1, a = -1 / (sign + axis.z), b = axis.x * axis.y * a;
+    double radius = sqrt(z < 1 ? (1 - z) * (1 + z) : 0);
+    double u = radius * cos(2 * METROI_PI * turn), v = radius * sin(2 * METROI_PI * turn);
+    return metro_vec3_make(u * (1 + sign * axis.x * axis.x * a) + v * b + z * axis.x,
+                           u * sign * b + v * (sign + axis.y * axis.y * a) + z * axis.y,
+                           -u * sign * axis.x - v * axis.y + z * axis.z);
+}
+
+/* A uniform point of a disc lifted onto the hemisphere has the density cos/pi (Malley 1988): its height is the root
+   of a uniform number. The glossy lobe is a power of the cosine about the mirror direction, so its height is a root
+   of order n + 1. One number serves twice: it chooses the lobe, and what is left of it is uniform again. */
+
+static inline metro_vec3 metroi_surface_draw(const metroi_surface *surface, metro_vec3 normal, metro_vec3 out,
+                                             double u, double v)
+{
+    if (u < surface->share) return metroi_direction_at(normal, sqrt(1 - u / surface->share), v);
+    u = (u - surface->share) / (1 - surface->share);
+    out = metro_subtract(metro_scale(normal, 2 * metro_dot(normal, out)), out);
+    return metroi_direction_at(out, pow(1 - u, 1 / (surface->exponent + 1)), v);
+}
+
+METRO_API metro_vec3 metro_brdf(const metro_material *material, metro_vec3 normal, metro_vec3 in, metro_vec3 out)
+{
+    metroi_surface surface = metroi_surface_make(material);
+    return metroi_surface_scatter(&surface, normal, in, out).value;
+}
+
+METRO_API double metro_brdf_density(const metro_material *material, metro_vec3 normal, metro_vec3 in, metro_vec3 out)
+{
+    metroi_surface surface = metroi_surface_make(material);
+    return surface.black ? 0 : metroi_surface_scatter(&surface, normal, in, out).density;
+}
+
+METRO_API double metro_brdf_sample(const metro_material *material, metro_vec3 normal, metro_vec3 out, double u,
+                                   double v, metro_vec3 *in)
+{
+    metroi_surface surface = metroi_surface_make(material);
+    *in = metroi_surface_draw(&surface, normal, out, u, v);
+    return surface.black ? 0 : metroi_surface_scatter(&surface, normal, *in, out).density;
+}
+
+/* # 11.2 Lamps
+
+   A lamp is a triangle whose material emits. Among many, one is chosen with a probability proportional to area times
+   luminance, and then a point of it, uniformly: the square of (u, v) is folded onto the triangle by a root (Turk
+   1990). The density per area of a point on triangle j is
+
+       p_A = frac{Y_j}{sum_{i} A_i Y_i}                                               (11.3)
+
+   with $Y$ the luminance of the emission: it does not depend on the size of the triangle, so a lamp may be cut into
+   as many pieces as one likes. */
+
+static double metroi_light_density(const metro_scene *scene, const metroi_surface *surface)
+{
+    metro_vec3 ke = surface->emission;
+    return metro_luminance(ke.x, ke.y, ke.z) / scene->light_power; /* eq 11.3 */
+}
+
+/* The lamp of the number u in [0, 1); what is left of u is uniform in [0, 1) again. */
+
+static uint32_t metroi_light_choose(const metro_scene *scene, double *u)
+{
+    size_t low = 0, high = scene->light_count - 1;
+    double before, share;
+    while (low < high) {
+        size_t middle = low + (high - low) / 2;
+        if (scene->light_sum[middle] > *u) high = middle;
+        else low = middle + 1;
+    }
+    before = low > 0 ? scene->light_sum[low - 1] : 0;
+    share = scene->light_sum[low] - before;
+    *u = share > 0 ? (*u - before) / share : 0;
+    if (!(*u < 1)) *u = 1 - 1e-16;
+    return scene->light[low];
+}
+
+static metro_vec3 metroi_triangle_point(const metro_scene *scene, uint32_t triangle, double u, double v)
+{
+    metro_vec3 p[3];
+    double root = sqrt(u);
+    metroi_triangle_corners(scene, triangle, p);
+    return metro_add(metro_scale(p[0], 1 - root),
+                     metro_add(metro_scale(p[1], root * (1 - v)), metro_scale(p[2], root * v)));
+}
+
+/* # 11.3 The camera
+
+   The film stands at distance 1 before the eye: its upper edge is at height tan(fov/2). With the view direction f, r
+   to the right and u upwards the ray through the film position (x, y) has the direction
+
+       d = f + tan("fov"/2) ((frac{2 x}{W} - 1) frac{W}{H} r - (frac{2 y}{H} - 1) u)              (11.4)
+
+   A pixel is the mean over its square. Let x and y be drawn uniformly over the whole film, of area $A = 4 tan^2
+   frac{W}{H}$. An area element of the film at the angle theta from f covers the solid angle cos^3(theta) of it, so
+   the density of the direction per steradian is
+
+       p(omega) = frac{1}{A cos^3(theta)}                                             (11.5)
+
+   and this is also how strongly the camera responds to light from there: what arrives from omega with that density
+   counts fully. */
+
+typedef struct {
+    metro_vec3 eye, forward, right, down; /* right and down reach from the middle of the film to its edges */
+    double width, height;
+    double right2, down2;                 /* their squared lengths */
+    double density;                       /* 1/A */
+} metroi_camera;
+
+METRO_API metro_result metro_camera_check(const metro_camera *camera)
+{
+    metro_vec3 forward = metro_normalize(metro_subtract(camera->look, camera->eye));
+    metro_vec3 across = metro_cross(forward, metro_normalize(camera->up));
+    if (!(metro_dot(across, across) > 1e-20) || !(camera->fov > 0 && camera->fov < 180)) return METRO_ERROR_ARGUMENT;
+    return isfinite(metroi_largest_component(camera->eye)) ? METRO_OK : METRO_ERROR_ARGUMENT;
+}
+
+static metroi_camera metroi_camera_make(const metro_camera *camera, size_t width, size_t height)
+{
+    metroi_camera c;
+    double t = camera->fov > 0 && camera->fov < 180 ? tan(camera->fov * METROI_PI / 360) : METROI_NAN;
+    double aspect = (double)width / (double)height;
+    c.eye = camera->eye;
+    c.forward = metro_normalize(metro_subtract(camera->look, camera->eye));
+    c.right = metro_normalize(metro_cross(c.forward, metro_normalize(camera->up)));
+    c.down = metro_scale(metro_cross(c.forward, c.right), t);
+    c.right = metro_scale(c.right, t * aspect);
+    c.width = (double)width;
+    c.height = (double)height;
+    c.right2 = metro_dot(c.right, c.right);
+    c.down2 = metro_dot(c.down, c.down);
+    c.density = 1 / (4 * t * t * aspect);
+    return c;
+}
+
+static metro_vec3 metroi_camera_direction(const metroi_camera *camera, double x, double y)
+{
+    metro_vec3 across = metro_scale(camera->right, 2 * x / camera->width - 1);
+    metro_vec3 along = metro_scale(camera->down, 2 * y / camera->height - 1);
+    return metro_normalize(metro_add(camera->forward, metro_add(across, along))); /* eq 11.4 */
+}
+
+/* The density of eq 11.5 for a unit direction in front of the camera. */
+static double metroi_camera_density(const metroi_camera *camera, metro_vec3 direction)
+{
+    double cosine = metro_dot(camera->forward, direction);
+    return camera->density / (cosine * cosine * cosine);
+}
+
+static int metroi_camera_project(const metroi_camera *camera, metro_vec3 point, double *x, double *y)
+{
+    metro_vec3 d = metro_subtract(point, camera->eye);
+    double depth = metro_dot(d, camera->forward), column, row;
+    if (!(depth > 0)) return 0;
+    column = (metro_dot(d, camera->right) / (depth * camera->right2) + 1) / 2 * camera->width;
+    row = (metro_dot(d, camera->down) / (depth * camera->down2) + 1) / 2 * camera->height;
+    if (!(column >= 0 && column < camera->width && row >= 0 && row < camera->height)) return 0;
+    *x = column;
+    *y = row;
+    return 1;
+}
+
+METRO_API metro_vec3 metro_camera_direction(const metro_camera *camera, size_t width, size_t height, double x,
+                                            double y)
+{
+    metroi_camera c = metroi_camera_make(camera, width, height);
+    return metroi_camera_direction(&c, x, y);
+}
+
+METRO_API int metro_camera_project(const metro_camera *camera, size_t width, size_t height, metro_vec3 point,
+                                   double *x, double *y)
+{
+    metroi_camera c = metroi_camera_make(camera, width, height);
+    return metroi_camera_project(&c, point, x, y);
+}
+
+/* # 12 Paths
+
+   The light that reaches a pixel is an integral over all paths from a lamp to the eye. A path of k edges has k + 1
+   vertices; with the throughput f of a path, the product of what its vertices reflect and of the geometry of its
+   edges, a pixel is (Veach 1997, chapter 8)
+
+       L = sum_{k=1}^{K} int f(x_0 .. x_k) dA(x_0) .. dA(x_k)                         (12.1)
+
+   All methods of this chapter draw paths at random and divide f by the density of what they drew. They differ in
+   where a path is begun. */
+
+/* # 12.1 Numbers
+
+   A walk asks for pairs of numbers: where on the film, which point of a lamp, which direction next. They come from
+   one of three places. A stream gives random ones. A state of the chain of chapter 4 gives its coordinates, each pair
+   a fixed place. And points that fill the square evenly give a pixel's own samples in each of the first few pairs,
+   where evenness pays; deeper pairs are random. */
+
+enum { METROI_FILM, METROI_LAMP, METROI_LAMP_DIRECTION, METROI_EYE_BOUNCE, METROI_LAMP_BOUNCE, METROI_LAMP_SAMPLE };
+
+typedef struct {
+    metro_rng *rng;        /* for what the others do not give */
+    const double *z;       /* a state, or NULL */
+    uint64_t scramble;     /* a pixel's own scramble of the even points, */
+    uint32_t index;        /* the number of the point, */
+    unsigned even_pairs;   /* and how many pairs are even */
+} metroi_numbers;
+
+/* The pairs in the order of their weight in the picture. */
+
+static unsigned metroi_pair_rank(int kind, int bounce)
+{
+    unsigned i = (unsigned)bounce;
+    switch (kind) {
+    case METROI_FILM: return 0;
+    case METROI_EYE_BOUNCE: return i == 1 ? 1 : 3 * i - 1;
+    case METROI_LAMP_SAMPLE: return i == 1 ? 2 : 3 * i;
+    case METROI_LAMP: return 3;
+    case METROI_LAMP_DIRECTION: return 4;
+    default: return 3 * i + 4;
+    }
+}
+
+/* The place of a pair in a state, which has no samples of its own at each vertex: film, lamp, and then the directions
+   of both walks in turn. */
+
+static size_t metroi_pair_place(int kind, int bounce)
+{
+    size_t i = (size_t)bounce;
+    switch (kind) {
+    case METROI_FILM: return 0;
+    case METROI_LAMP: return 1;
+    case METROI_LAMP_DIRECTION: return 2;
+    case METROI_EYE_BOUNCE: return 2 * i + 1;
+    default: return 2 * i + 2;
+    }
+}
+
+/* Even points: the first two coordinates of Sobol's sequence put one point into each of $2^k$ boxes of any shape, for
+   each run of $2^k$ points. Pairs are kept independent of each other by taking the points of each in an order of its
+   own, shuffled so that the runs stay together (Kollig and Keller 2002), and by scrambling their digits. Both are the
+   scrambling of section 2.3, eq 2.4, of the number of the point and of its coordinates; since a path takes up to
+   thirty of them, the coins come from one hash of the mirrored digits (Laine and Karras 2011, with the constants of
+   Vegdahl 2021), a tenth of the time of those of section 2.3 and even enough for pictures. */
+
+static inline uint32_t metroi_mirror(uint32_t x)
+{
+    x = x >> 16 | x << 16;
+    x = (x & 0x00ff00ffu) << 8 | (x & 0xff00ff00u) >> 8;
+    x = (x & 0x0f0f0f0fu) << 4 | (x & 0xf0f0f0f0u) >> 4;
+    x = (x & 0x33333333u) << 2 | (x & 0xccccccccu) >> 2;
+    return (x & 0x55555555u) << 1 | (x & 0xaaaaaaaau) >> 1;
+}
+
+/* Flips each digit by a coin that the digits below it decide. */
+static inline uint32_t metroi_flip(uint32_t x, uint32_t key)
+{
+    x ^= x * 0x3d20adeau;
+    x += key;
+    x *= (key >> 16) | 1u;
+    x ^= x * 0x05526c56u;
+    x ^= x * 0x53a22864u;
+    return x;
+}
+
+/* The digits of the second coordinate. Digit i of it is the sum of all digits a of the number for which the binomial
+   coefficient (a over i) is odd (eq 2.2: its direction numbers are the rows of Pascal's triangle modulo 2), that is,
+   for which the ones of i are among those of a. Five steps add up over the five digits of a. */
+static uint32_t metroi_pascal(uint32_t x)
+{
+    x ^= (x & 0xaaaaaaaau) >> 1;
+    x ^= (x & 0xccccccccu) >> 2;
+    x ^= (x & 0xf0f0f0f0u) >> 4;
+    x ^= (x & 0xff00ff00u) >> 8;
+    return x ^ x >> 16;
+}
+
+static void metroi_even_pair(uint32_t index, uint64_t key, double *u, double *v)
+{
+    uint32_t x = metroi_mirror(metroi_flip(metroi_mirror(index), (uint32_t)key)); /* the shuffled number */
+    uint64_t flips = metroi_mix(key);
+    *u = metroi_mirror(metroi_flip(x, (uint32_t)flips)) * (1.0 / 4294967296.0); /* the first is its mirror image */
+    *v = metroi_mirror(metroi_flip(metroi_pascal(x), (uint32_t)(flips >> 32))) * (1.0 / 4294967296.0);
+}
+
+static inline void metroi_numbers_pair(const metroi_numbers *numbers, int kind, int bounce, double *u, double *v)
+{
+    unsigned rank;
+    if (numbers->z != NULL) {
+        const double *z = numbers->z + 2 * metroi_pair_place(kind, bounce);
+        *u = z[0];
+        *v = z[1];
+        return;
+    }
+    rank = metroi_pair_rank(kind, bounce);
+    if (rank < numbers->even_pairs) {
+        metroi_even_pair(numbers->index, metroi_mix(numbers->scramble + rank), u, v);
+        return;
+    }
+    *u = metro_rng_uniform(numbers->rng);
+    *v = metro_rng_uniform(numbers->rng);
+}
+
+/* # 12.2 Walks
+
+   A walk from the eye gathers, a walk from a lamp shoots. Both are lists of vertices, and a vertex carries what the
+   walk has collected: the product of cosines and BRDFs over the densities of what was drawn, alpha. For the walk from
+   a lamp,
+
+       alpha_0 = frac{L_e}{p_A},  alpha_{i+1} = alpha_i frac{f cos(theta)}{p(omega)}             (12.2)
+
+   and for the walk from the eye alpha starts with 1, because eq 11.5 is both the density and the response of the
+   camera.
+
+   One path can be made in many ways: by a walk from the eye of t vertices, a walk from a lamp of s vertices, and an
+   edge that joins their ends. Which of the s + t = k + 1 pairs is good depends on the scene, and the weights of
+   section 12.3 choose. They need the densities, per area, of all vertices from both sides, so a vertex also keeps
+   what the sum over the other ways has become. */
+
+typedef struct {
+    metro_vec3 point, normal;
+    metro_vec3 origin;              /* of rays that leave it: off the surface, on the side of the normal */
+    metro_vec3 previous;            /* the unit direction to the vertex before */
+    metro_vec3 weight;              /* alpha of eq 12.2 */
+    const metroi_surface *surface;  /* NULL at the eye */
+    uint32_t triangle;
+    int lamp;                       /* the first vertex of a walk from a lamp */
+    double forward;                 /* the density per area with which the walk came here */
+    double a, b;                    /* eq 12.6 */
+} metroi_vertex;
+
+typedef struct {
+    const metro_scene *scene;
+    const metroi_surface *surface;  /* [material_count + 1] */
+    metroi_camera camera;
+    int depth, shortest;            /* the most and the fewest edges of a path */
+    int from_eye, from_lamp;        /* which walks are made */
+    int uniform_directions;         /* directions are points of the sphere, with density 1/(4 pi): section 13.1 */
+    int one_connection;
+    int separate;                   /* each contribution is kept apart: for the pyramid */
+    metro_heuristic heuristic;
+} metroi_tracer;
+
+/* What a path contributes to the picture: at one place for all ways that end in the walk from the eye, and anywhere
+   for those that reach the film from a lamp. */
+
+typedef struct {
+    metro_vec3 color;
+    uint32_t pixel;
+    uint16_t s, t;
+} metroi_splat;
+
+typedef struct {
+    size_t count;
+    uint64_t rays;
+    double importance;     /* of the state it belongs to, in a chain */
+    metroi_splat splat[1]; /* really as many as metroi_sample_room says */
+} metroi_sample;
+
+static size_t metroi_sample_room(const metroi_tracer *tracer)
+{
+    size_t depth = (size_t)tracer->depth;
+    return tracer->separate ? (depth + 1) * (depth + 2) / 2 : depth + 2;
+}
+
+static size_t metroi_sample_size(const metroi_tracer *tracer)
+{
+    return sizeof(metroi_sample) + metroi_sample_room(tracer) * sizeof(metroi_splat);
+}
+
+static metro_vec3 metroi_multiply(metro_vec3 a, metro_vec3 b)
+{
+    return metro_vec3_make(a.x * b.x, a.y * b.y, a.z * b.z);
+}
+
+static double metroi_color_luminance(metro_vec3 color)
+{
+    return metro_luminance(color.x, color.y, color.z);
+}
+
+static int metroi_color_black(metro_vec3 color)
+{
+    return !(color.x > 0 || color.y > 0 || color.z > 0);
+}
+
+static void metroi_sample_add(metroi_sample *sample, const metroi_tracer *tracer, uint32_t pixel, int s, int t,
+                              metro_vec3 color)
+{
+    metroi_splat *splat = sample->splat, *end = splat + sample->count;
+    if (metroi_color_black(color)) return;
+    if (!tracer->separate)
+        for (; splat < end; splat++)
+            if (splat->pixel == pixel) {
+                splat->color = metro_add(splat->color, color);
+                return;
+            }
+    splat = end;
+    sample->count++;
+    splat->color = color;
+    splat->pixel = pixel;
+    splat->s = (uint16_t)s;
+    splat->t = (uint16_t)t;
+}
+
+/* # 12.3 Weights
+
+   Let $p_s$ be the density with which the way of s vertices from the lamp makes a given path. Any weights w_s that
+   sum to 1 over the ways leave the mean right; those of the power heuristic (Veach and Guibas 1995)
+
+       w_s = frac{p_s^2}{sum_{i} p_i^2}                                               (12.3)
+
+   keep the variance low, and so does the balance heuristic, which has the power 1. Neighbouring densities have a
+   simple ratio: the two ways differ in one vertex, which one draws forwards and the other backwards. With f_i the
+   density of vertex i from its own walk, and b_i the density with which the other walk would have drawn it,
+
+       frac{p_{s+1}}{p_s} = frac{b_{t-1}}{f_{t-1}}                                    (12.4)
+
+   for the last vertex of the eye's walk, and so on towards the eye, and the same on the other side towards the lamp.
+   So 1/w_s = 1 + S_y + S_z, where each sum, with h(x) = x^2 or x, is a nest
+
+       S = h(frac{b_n}{f_n}) (1 + h(frac{b_{n-1}}{f_{n-1}}) (1 + h(frac{b_{n-2}}{f_{n-2}}) (1 + ...)))      (12.5)
+
+   Only b_n and b_{n-1} depend on what is joined. The rest is known when vertex n is made, and vertex n carries it
+   (Georgiev 2012): with q_n the density per steradian of going back from n to n-1, and g_n = cos(theta_{n-1})/d^2,
+   which makes it one per area,
+
+       A_n = h(frac{1}{f_n}),  B_n = h(frac{g_n}{f_{n-1}}) (1 + h(q_{n-1}) B_{n-1}),
+       S = h(b_n) A_n (1 + h(q_n) B_n)                                                (12.6)
+
+   The eye is never met by accident: its density is infinite, and B_1 = 0. */
+
+static double metroi_power(const metroi_tracer *tracer, double x)
+{
+    return tracer->heuristic == METRO_BALANCE ? x : x * x;
+}
+
+/* S of eq 12.5, by eq 12.6, for the densities with which the other side comes here, per area, and goes on, per
+   steradian. */
+static inline double metroi_ways(const metroi_tracer *tracer, const metroi_vertex *vertex, double here, double on)
+{
+    return metroi_power(tracer, here) * vertex->a * (1 + metroi_power(tracer, on) * vertex->b); /* eq 12.6 */
+}
+
+/* What a vertex does between the direction `toward` and that of the vertex before it: `density` is that of drawing
+   `toward`, `reverse` that of the walk the other way round. The BRDF is symmetric, so a vertex need not know which
+   walk it is on. A lamp's own vertex emits evenly and draws directions by their cosine. With uniform directions all
+   densities are the same. */
+
+static inline metroi_scatter metroi_vertex_scatter(const metroi_tracer *tracer, const metroi_vertex *vertex,
+                                            metro_vec3 toward)
+{
+    metroi_scatter s;
+    if (vertex->lamp) {
+        s.value = metro_vec3_make(1, 1, 1);
+        s.density = metro_dot(vertex->normal, toward) / METROI_PI;
+        s.reverse = 0;
+    } else s = metroi_surface_scatter(vertex->surface, vertex->normal, toward, vertex->previous);
+    if (tracer->uniform_directions) s.density = s.reverse = 1 / (4 * METROI_PI);
+    return s;
+}
+
+/* # 12.4 Going on
+
+   A vertex is where a ray arrives. `density` is that of the direction, per steradian, and `back` the density with
+   which a walk that came the other way would go on from `from` to the vertex before it. Nothing is seen of the back
+   of a triangle, so a walk ends there. When there are no walks from a lamp, the only two ways are to meet the lamp
+   and to aim at it from the last vertex but one, and the rest of the nest is cut off. */
+
+static inline void metroi_triangle_vertex(const metro_scene *scene, const metro_hit *hit, metro_vec3 *point,
+                                   metro_vec3 *normal)
+{
+    metro_vec3 p[3], a, b;
+    metroi_triangle_corners(scene, hit->triangle, p);
+    a = metro_subtract(p[1], p[0]);
+    b = metro_subtract(p[2], p[0]);
+    *point = metro_add(p[0], metro_add(metro_scale(a, hit->u), metro_scale(b, hit->v)));
+    a = metro_cross(a, b);
+    *normal = metro_scale(a, 1 / sqrt(metro_dot(a, a)));
+}
+
+static int metroi_walk_arrive(const metroi_tracer *tracer, metroi_sample *sample, const metroi_vertex *from,
+                              metro_vec3 direction, double density, double back, metroi_vertex *to)
+{
+    const metro_scene *scene = tracer->scene;
+    double cosine, distance2;
+    metro_hit hit;
+    sample->rays++;
+    if (!metro_scene_hit(scene, from->origin, direction, 0, METROI_INFINITY, &hit)) return 0;
+    metroi_triangle_vertex(scene, &hit, &to->point, &to->normal);
+    cosine = -metro_dot(to->normal, direction);
+    if (!(cosine > 0)) return 0;
+    to->surface = tracer->surface + scene->material_of[hit.triangle];
+    to->origin = metroi_scene_leave(scene, hit.triangle, to->point, to->normal);
+    to->triangle = hit.triangle;
+    to->lamp = 0;
+    to->previous = metro_scale(direction, -1);
+    direction = metro_subtract(to->point, from->point);
+    distance2 = metro_dot(direction, direction);
+    if (!(distance2 > 0)) return 0;
+    to->forward = density * cosine / distance2;
+    to->a = metroi_power(tracer, 1 / to->forward);
+    cosine = -metro_dot(from->normal, to->previous);
+    to->b = metroi_power(tracer, cosine / (distance2 * from->forward))
+          * (1 + metroi_power(tracer, back) * from->b); /* eq 12.6 */
+    if (!tracer->from_lamp) {
+        to->b = 0;
+        if (from->surface == NULL) to->a = 0;
+    }
+    return 1;
+}
+
+/* The first vertex of each walk. */
+
+static void metroi_walk_eye(const metroi_tracer *tracer, metroi_vertex *vertex)
+{
+    memset(vertex, 0, sizeof *vertex);
+    vertex->point = vertex->origin = tracer->camera.eye;
+    vertex->normal = tracer->camera.forward;
+    vertex->weight = metro_vec3_make(1, 1, 1);
+    vertex->forward = METROI_INFINITY;
+}
+
+static void metroi_walk_lamp(const metroi_tracer *tracer, double u, double v, metroi_vertex *vertex)
+{
+    const metro_scene *scene = tracer->scene;
+    memset(vertex, 0, sizeof *vertex);
+    vertex->triangle = metroi_light_choose(scene, &u);
+    vertex->point = metroi_triangle_point(scene, vertex->triangle, u, v);
+    vertex->normal = metroi_triangle_normal(scene, vertex->triangle);
+    vertex->origin = metroi_scene_leave(scene, vertex->triangle, vertex->point, vertex->normal);
+    vertex->surface = tracer->surface + scene->material_of[vertex->triangle];
+    vertex->lamp = 1;
+    vertex->forward = metroi_light_density(scene, vertex->surface);
+    vertex->weight = metro_scale(vertex->surface->emission, 1 / vertex->forward); /* eq 12.2 */
+    vertex->a = metroi_power(tracer, 1 / vertex->forward);
+}
+
+/* The direction in which a walk goes on from a vertex, as its numbers say. */
+
+static inline metro_vec3 metroi_walk_direction(const metroi_tracer *tracer, const metroi_numbers *numbers,
+                                        const metroi_vertex *vertex, int kind, int bounce)
+{
+    double u, v;
+    if (tracer->uniform_directions) {
+        const double *z = numbers->z + 3 * metroi_pair_place(kind, bounce) - 2; /* two pairs stand before */
+        return metro_vec3_make(z[0], z[1], z[2]);
+    }
+    metroi_numbers_pair(numbers, kind, bounce, &u, &v);
+    if (vertex->lamp) return metroi_direction_at(vertex->normal, sqrt(1 - u), v);
+    return metroi_surface_draw(vertex->surface, vertex->normal, vertex->previous, u, v);
+}
+
+/* A walk from the eye that carries little is ended by a coin and otherwise carries more, which leaves the mean as it
+   is (Russian roulette, Arvo and Kirk 1990). The coin is no part of the densities above: weights that sum to 1 need
+   not know of it. A state of a chain has no coins. */
+
+static int metroi_walk_survives(const metroi_numbers *numbers, int bounce, metro_vec3 *weight)
+{
+    double chance = 4 * metroi_color_luminance(*weight);
+    if (numbers->z != NULL || bounce < 3 || chance >= 1) return 1;
+    if (chance < 0.05) chance = 0.05;
+    if (metro_rng_uniform(numbers->rng) >= chance) return 0;
+    *weight = metro_scale(*weight, 1 / chance);
+    return 1;
+}
+
+/* Carries the walk on from its last vertex until it has `most` vertices or ends; returns how many it has. */
+
+static int metroi_walk_on(const metroi_tracer *tracer, const metroi_numbers *numbers, metroi_sample *sample, int eye,
+                       metroi_vertex *vertex, int count, int most)
+{
+    for (; count < most; count++) {
+        const metroi_vertex *from = &vertex[count - 1];
+        metroi_vertex *to = &vertex[count];
+        int kind = eye ? METROI_EYE_BOUNCE : from->lamp ? METROI_LAMP_DIRECTION : METROI_LAMP_BOUNCE;
+        metro_vec3 direction;
+        metroi_scatter s;
+        double cosine;
+        if (!from->lamp && from->surface->black) break;
+        direction = metroi_walk_direction(tracer, numbers, from, kind, count - 1);
+        cosine = metro_dot(from->normal, direction);
+        if (!(cosine > 0)) break;
+        s = metroi_vertex_scatter(tracer, from, direction);
+        if (!(s.density > 0)) break;
+        to->weight = metro_scale(metroi_multiply(from->weight, s.value), cosine / s.density); /* eq 12.2 */
+        if (eye && !metroi_walk_survives(numbers, count - 1, &to->weight)) break;
+        if (!metroi_walk_arrive(tracer, sample, from, direction, s.density, s.reverse, to)) break;
+    }
+    return count;
+}
+
+/* The walk from the eye through the film position (x, y), and the one from a lamp. */
+
+static int metroi_walk_from_eye(const metroi_tracer *tracer, const metroi_numbers *numbers, metroi_sample *sample,
+                                double x, double y, metroi_vertex *vertex, int most)
+{
+    metro_vec3 direction = metroi_camera_direction(&tracer->camera, x, y);
+    double density = metroi_camera_density(&tracer->camera, direction);
+    metroi_walk_eye(tracer, &vertex[0]);
+    if (most < 2) return 1;
+    vertex[1].weight = vertex[0].weight;
+    if (!metroi_walk_arrive(tracer, sample, &vertex[0], direction, density, 0, &vertex[1])) return 1;
+    return metroi_walk_on(tracer, numbers, sample, 1, vertex, 2, most);
+}
+
+static int metroi_walk_from_lamp(const metroi_tracer *tracer, const metroi_numbers *numbers, metroi_sample *sample,
+                                 metroi_vertex *vertex, int most)
+{
+    double u, v;
+    if (most < 1) return 0;
+    metroi_numbers_pair(numbers, METROI_LAMP, 0, &u, &v);
+    metroi_walk_lamp(tracer, u, v, &vertex[0]);
+    return metroi_walk_on(tracer, numbers, sample, 0, vertex, 1, most);
+}
+
+/* # 12.5 Joining
+
+   A way with s = 0 needs no join: the walk from the eye has met a lamp. */
+
+static double metroi_heuristic(const metroi_tracer *tracer, double others)
+{
+    return tracer->heuristic == METRO_UNWEIGHTED || !tracer->from_eye ? 1 : 1 / (1 + others); /* eq 12.3 */
+}
+
+static metro_vec3 metroi_join_met(const metroi_tracer *tracer, const metroi_vertex *z)
+{
+    metro_vec3 emission = z->surface->emission;
+    double on = metro_dot(z->normal, z->previous) / METROI_PI, here;
+    if (metroi_color_black(emission)) return emission;
+    if (tracer->uniform_directions) on = 1 / (4 * METROI_PI);
+    here = metroi_light_density(tracer->scene, z->surface);
+    here = metroi_heuristic(tracer, metroi_ways(tracer, z, here, on));
+    return metro_scale(metroi_multiply(z->weight, emission), here);
+}
+
+/* Nothing stands between two vertices: seen from origins off both surfaces, so that neither hides the other. The
+   single precision of t knows the far end to some 1e-7 of the way only, which for small triangles is more than they
+   are moved off, so the look ends sixteen such steps before it. */
+
+static int metroi_join_open(const metroi_tracer *tracer, metroi_sample *sample, const metroi_vertex *y,
+                            const metroi_vertex *z)
+{
+    const double end = 1 - 16.0 / (1 << 23);
+    sample->rays++;
+    return !metro_scene_occluded(tracer->scene, z->origin, metro_subtract(y->origin, z->origin), 0, end);
+}
+
+/* The end y of a walk from a lamp and the end z of one from the eye, joined by an edge:
+
+       L = alpha_z f(z) frac{cos(theta_z) cos(theta_y)}{d^2} V(z, y) f(y) alpha_y                (12.7) */
+
+static metro_vec3 metroi_join_edge(const metroi_tracer *tracer, metroi_sample *sample, const metroi_vertex *y,
+                                   const metroi_vertex *z)
+{
+    metro_vec3 black = metro_vec3_make(0, 0, 0), d = metro_subtract(y->point, z->point), color;
+    double distance2 = metro_dot(d, d), cos_y, cos_z, others = 0;
+    metroi_scatter at_y, at_z;
+    if (z->surface->black || (!y->lamp && y->surface->black) || !(distance2 > 0)) return black;
+    d = metro_scale(d, 1 / sqrt(distance2));
+    cos_z = metro_dot(z->normal, d);
+    cos_y = -metro_dot(y->normal, d);
+    if (!(cos_z > 0) || !(cos_y > 0)) return black;
+    at_z = metroi_vertex_scatter(tracer, z, d);
+    at_y = metroi_vertex_scatter(tracer, y, metro_scale(d, -1));
+    color = metroi_multiply(metroi_multiply(z->weight, at_z.value), metroi_multiply(y->weight, at_y.value));
+    if (metroi_color_black(color) || !metroi_join_open(tracer, sample, y, z)) return black;
+    if (tracer->from_lamp) others = metroi_ways(tracer, z, at_y.density * cos_z / distance2, at_z.reverse);
+    others += metroi_ways(tracer, y, at_z.density * cos_y / distance2, at_y.reverse);
+    return metro_scale(color, cos_y * cos_z / distance2 * metroi_heuristic(tracer, others)); /* eq 12.7 */
+}
+
+/* The end y of a walk from a lamp, joined to the eye. The response of the camera stands in the place of f(z) cos: eq
+   11.5. Returns where on the film it is seen. */
+
+static int metroi_join_eye(const metroi_tracer *tracer, metroi_sample *sample, const metroi_vertex *y,
+                           const metroi_vertex *eye, uint32_t *pixel, metro_vec3 *color)
+{
+    metro_vec3 d = metro_subtract(y->point, eye->point);
+    double distance2 = metro_dot(d, d), cosine, response, row, column, others;
+    metroi_scatter at_y;
+    if ((!y->lamp && y->surface->black) || !(distance2 > 0)) return 0;
+    if (!metroi_camera_project(&tracer->camera, y->point, &column, &row)) return 0;
+    d = metro_scale(d, 1 / sqrt(distance2));
+    cosine = -metro_dot(y->normal, d);
+    if (!(cosine > 0)) return 0;
+    at_y = metroi_vertex_scatter(tracer, y, metro_scale(d, -1));
+    *color = metroi_multiply(y->weight, at_y.value);
+    if (metroi_color_black(*color) || !metroi_join_open(tracer, sample, y, eye)) return 0;
+    response = metroi_camera_density(&tracer->camera, d) * cosine / distance2;
+    others = metroi_ways(tracer, y, response, at_y.reverse);
+    *color = metro_scale(*color, response * metroi_heuristic(tracer, others));
+    *pixel = (uint32_t)row * (uint32_t)tracer->camera.width + (uint32_t)column;
+    return 1;
+}
+
+/* # 12.6 All ways of a path
+
+   One walk from each side gives one path for each pair of their vertices. To join them all is Lafortune and Willems'
+   (1993) way, the paper's; Veach and Guibas (1995) join one pair for each length, chosen at random and counted as
+   often as there were choices. Where the walk from the eye aims at a lamp, s = 1, each vertex draws a point of the
+   lamp for itself, unless the numbers are the state of a chain: there one point serves all.
+
+   [figure: fig3.svg | A path of two walks and the step that joins them, drawn in its scene (figure 3 of the paper).]
+
+   [figure: pyramid.svg | What each way contributes, weighted by the power heuristic: the pictures add up to the
+   picture.] */
+
+typedef struct {
+    metroi_vertex y[METRO_DEPTH_MOST + 1], z[METRO_DEPTH_MOST + 2];
+    int lamp_count, eye_count;
+    int chosen[METRO_DEPTH_MOST + 1]; /* the s of each length, where one connection is made */
+} metroi_walks;
+
+/* How often a join counts: not at all, once, or, when it was chosen from k + 1, k + 1 times. */
+static double metroi_path_share(const metroi_tracer *tracer, const metroi_walks *walks, int s, int t)
+{
+    int edges = s + t - 1;
+    if (edges > tracer->depth || edges < tracer->shortest) return 0;
+    if (!tracer->one_connection) return 1;
+    return walks->chosen[edges] == s ? edges + 1 : 0;
+}
+
+static void metroi_path_aim(const metroi_tracer *tracer, const metroi_numbers *numbers, metroi_sample *sample,
+                            metroi_walks *walks, int t, uint32_t pixel)
+{
+    double share = metroi_path_share(tracer, walks, 1, t), u, v;
+    metroi_vertex *y = &walks->y[0], fresh;
+    if (!(share > 0) || walks->z[t - 1].surface->black) return;
+    if (numbers->z == NULL) {
+        metroi_numbers_pair(numbers, METROI_LAMP_SAMPLE, t - 1, &u, &v);
+        metroi_walk_lamp(tracer, u, v, &fresh);
+        y = &fresh;
+    }
+    metroi_sample_add(sample, tracer, pixel, 1, t,
+                      metro_scale(metroi_join_edge(tracer, sample, y, &walks->z[t - 1]), share));
+}
+
+static void metroi_path_from_eye(const metroi_tracer *tracer, const metroi_numbers *numbers, metroi_sample *sample,
+                                 metroi_walks *walks, uint32_t pixel)
+{
+    int s, t;
+    for (t = 2; t <= walks->eye_count; t++) {
+        const metroi_vertex *z = &walks->z[t - 1];
+        double share = metroi_path_share(tracer, walks, 0, t);
+        if (share > 0) metroi_sample_add(sample, tracer, pixel, 0, t, metro_scale(metroi_join_met(tracer, z), share));
+        metroi_path_aim(tracer, numbers, sample, walks, t, pixel);
+        for (s = 2; s <= walks->lamp_count; s++) {
+            share = metroi_path_share(tracer, walks, s, t);
+            if (!(share > 0)) continue;
+            metroi_sample_add(sample, tracer, pixel, s, t,
+                              metro_scale(metroi_join_edge(tracer, sample, &walks->y[s - 1], z), share));
+        }
+    }
+}
+
+static void metroi_path_from_lamp(const metroi_tracer *tracer, metroi_sample *sample, const metroi_walks *walks)
+{
+    metro_vec3 color;
+    uint32_t pixel;
+    int s;
+    for (s = 1; s <= walks->lamp_count; s++) {
+        double share = metroi_path_share(tracer, walks, s, 1);
+        if (share > 0 && metroi_join_eye(tracer, sample, &walks->y[s - 1], &walks->z[0], &pixel, &color))
+            metroi_sample_add(sample, tracer, pixel, s, 1, metro_scale(color, share));
+    }
+}
+
+/* All that the walks through the film position (x, y) contribute to the picture: one sample of eq 12.1. */
+
+static void metroi_trace(const metroi_tracer *tracer, const metroi_numbers *numbers, double x, double y,
+                         metroi_sample *sample)
+{
+    metroi_walks walks;
+    uint32_t pixel = (uint32_t)y * (uint32_t)tracer->camera.width + (uint32_t)x;
+    int k, depth = tracer->depth;
+    sample->count = 0;
+    sample->rays = 0;
+    for (k = 1; tracer->one_connection && k <= depth; k++)
+        walks.chosen[k] = (int)metro_rng_below(numbers->rng, (uint64_t)k + 1);
+    walks.lamp_count = walks.eye_count = 0;
+    if (tracer->from_lamp) walks.lamp_count = metroi_walk_from_lamp(tracer, numbers, sample, walks.y, depth);
+    if (tracer->from_eye) {
+        walks.eye_count = metroi_walk_from_eye(tracer, numbers, sample, x, y, walks.z, depth + 1);
+        metroi_path_from_eye(tracer, numbers, sample, &walks, pixel);
+    } else metroi_walk_eye(tracer, &walks.z[0]);
+    if (tracer->from_lamp) metroi_path_from_lamp(tracer, sample, &walks);
+}
+
+/* # 12.7 A picture that grows
+
+   Jobs write what they found into logs, and the logs are added up in the order of jobs (section 1.3), so that the
+   picture is the same on any number of threads. A log has room for all that its job can find. */
+
+typedef struct {
+    float color[3];
+    uint32_t pixel;
+    uint16_t s, t;
+} metroi_log_entry;
+
+typedef struct {
+    uint64_t samples, rays, not_finite;
+    double luminance, luminance2;  /* sums over the samples, of all that a sample contributes */
+    size_t count;
+    metroi_log_entry entry[1];     /* really as many as the slot has room for */
+} metroi_log;
+
+static size_t metroi_log_size(size_t entries)
+{
+    return (sizeof(metroi_log) + entries * sizeof(metroi_log_entry) + 15) / 16 * 16;
+}
+
+static void metroi_log_add(metroi_log *log, const metroi_splat *splat, double weight)
+{
+    metroi_log_entry *entry = &log->entry[log->count];
+    metro_vec3 color = metro_scale(splat->color, weight);
+    if (!isfinite(metroi_color_sum(color))) {
+        log->not_finite++;
+        return;
+    }
+    entry->color[0] = (float)color.x;
+    entry->color[1] = (float)color.y;
+    entry->color[2] = (float)color.z;
+    entry->pixel = splat->pixel;
+    entry->s = splat->s;
+    entry->t = splat->t;
+    log->count++;
+}
+
+/* A canvas holds sums: of the picture, of each way if asked for, and of the luminance of each block of 8 x 8 pixels
+   in batches - the chains of a Metropolis method, or groups of rounds - whose spread gives the errors of the blocks.
+   */
+
+typedef struct {
+    size_t width, height, columns, rows, batches;
+    double *sum;     /* [3 * width * height] */
+    double *way;     /* [ways * 3 * width * height] or NULL */
+    double *block;   /* [batches * columns * rows] */
+    int depth;
+    uint64_t samples, rays, not_finite;
+    double luminance, luminance2;
+} metroi_canvas;
+
+static size_t metroi_way_index(int depth, int s, int t)
+{
+    return (size_t)s * (size_t)(depth + 2) + (size_t)t;
+}
+
+static void *metroi_zeros(size_t count, size_t size)
+{
+    void *memory;
+    if (!metroi_size_multiply(count, size, &size) || size == 0) return NULL;
+    memory = METRO_MALLOC(size);
+    if (memory != NULL) memset(memory, 0, size);
+    return memory;
+}
+
+static void metroi_canvas_free(metroi_canvas *canvas)
+{
+    METRO_FREE(canvas->sum);
+    METRO_FREE(canvas->way);
+    METRO_FREE(canvas->block);
+    memset(canvas, 0, sizeof *canvas);
+}
+
+static metro_result metroi_canvas_make(size_t width, size_t height, size_t batches, int depth, int ways,
+                                       metroi_canvas *canvas)
+{
+    size_t pixels = width * height, count = 1, most = metroi_way_index(depth, depth + 1, 0);
+    memset(canvas, 0, sizeof *canvas);
+    canvas->width = width;
+    canvas->height = height;
+    canvas->columns = (width + 7) / 8;
+    canvas->rows = (height + 7) / 8;
+    canvas->batches = batches;
+    canvas->depth = depth;
+    canvas->sum = (double *)metroi_zeros(pixels, 3 * sizeof(double));
+    canvas->block = (double *)metroi_zeros(batches, canvas->columns * canvas->rows * sizeof(double));
+    if (ways && !metroi_size_multiply(pixels, most, &count)) return METRO_ERROR_MEMORY;
+    if (ways) canvas->way = (double *)metroi_zeros(count, 3 * sizeof(double));
+    if (canvas->sum != NULL && canvas->block != NULL && (!ways || canvas->way != NULL)) return METRO_OK;
+    metroi_canvas_free(canvas);
+    return METRO_ERROR_MEMORY;
+}
+
+static void metroi_canvas_add(metroi_canvas *canvas, const metroi_log *log, size_t batch)
+{
+    size_t i, c, pixels = canvas->width * canvas->height;
+    double *block = canvas->block + batch * canvas->columns * canvas->rows;
+    for (i = 0; i < log->count; i++) {
+        const metroi_log_entry *entry = &log->entry[i];
+        size_t x = entry->pixel % canvas->width, y = entry->pixel / canvas->width;
+        for (c = 0; c < 3; c++) canvas->sum[3 * entry->pixel + c] += (double)entry->color[c];
+        block[y / 8 * canvas->columns + x / 8] += metro_luminance((double)entry->color[0], (double)entry->color[1],
+                                                                  (double)entry->color[2]);
+        if (canvas->way != NULL) {
+            size_t index = metroi_way_index(canvas->depth, entry->s, entry->t);
+            double *way = canvas->way + 3 * (index * pixels + entry->pixel);
+            for (c = 0; c < 3; c++) way[c] += (double)entry->color[c];
+        }
+    }
+    canvas->samples += log->samples;
+    canvas->rays += log->rays;
+    canvas->not_finite += log->not_finite;
+    canvas->luminance += log->luminance;
+    canvas->luminance2 += log->luminance2;
+}
+
+/* # 12.8 Rounds of paths
+
+   A round traces one path through each pixel. Its jobs take 256 pixels each, in groups of sixteen, so that the logs
+   stay small whatever the size of the picture. */
+
+enum { METROI_JOB_PIXELS = 256, METROI_ROUND_JOBS = 16, METROI_PATH_BATCHES = 16, METROI_EVEN_PAIRS = 9 };
+
+typedef struct {
+    metroi_tracer tracer;
+    metroi_canvas *canvas;
+    uint64_t key;          /* of the streams and scrambles */
+    unsigned even_pairs;
+    size_t threads;
+    size_t jobs;           /* in a round, rounded up to whole groups */
+    /* called with each log before it is added; may be NULL */
+    void (*look)(const metroi_log *log, void *user);
+    void *user;
+} metroi_path_plan;
+
+static size_t metroi_path_jobs(size_t pixels)
+{
+    size_t jobs = (pixels + METROI_JOB_PIXELS - 1) / METROI_JOB_PIXELS;
+    return (jobs + METROI_ROUND_JOBS - 1) / METROI_ROUND_JOBS * METROI_ROUND_JOBS;
+}
+
+static void metroi_path_pixel(const metroi_path_plan *plan, metro_rng *rng, size_t pixel, uint64_t round,
+                              metroi_sample *sample)
+{
+    metroi_numbers numbers;
+    double u, v, x = (double)(pixel % plan->canvas->width), y = (double)(pixel / plan->canvas->width);
+    numbers.rng = rng;
+    numbers.z = NULL;
+    numbers.scramble = metroi_mix(plan->key + pixel * UINT64_C(0x9e3779b97f4a7c15));
+    numbers.index = (uint32_t)round;
+    numbers.even_pairs = plan->even_pairs;
+    metroi_numbers_pair(&numbers, METROI_FILM, 0, &u, &v);
+    metroi_trace(&plan->tracer, &numbers, x + u, y + v, sample);
+}
+
+static metro_result metroi_path_work(uint64_t job, void *slot, void *user)
+{
+    const metroi_path_plan *plan = (const metroi_path_plan *)user;
+    metroi_log *log = (metroi_log *)slot;
+    size_t pixels = plan->canvas->width * plan->canvas->height, pixel, end, i;
+    uint64_t round = job / plan->jobs;
+    metro_rng rng = metro_rng_make(plan->key, job);
+    metroi_sample *sample = (metroi_sample *)METRO_MALLOC(metroi_sample_size(&plan->tracer));
+    if (sample == NULL) return METRO_ERROR_MEMORY;
+    pixel = (size_t)(job % plan->jobs) * METROI_JOB_PIXELS;
+    end = pixel + METROI_JOB_PIXELS < pixels ? pixel + METROI_JOB_PIXELS : pixels;
+    for (; pixel < end; pixel++) {
+        double luminance = 0;
+        metroi_path_pixel(plan, &rng, pixel, round, sample);
+        for (i = 0; i < sample->count; i++) {
+            metroi_log_add(log, &sample->splat[i], 1);
+            luminance += metroi_color_luminance(sample->splat[i].color);
+        }
+        log->samples++;
+        log->rays += sample->rays;
+        log->luminance += luminance;
+        log->luminance2 += luminance * luminance;
+    }
+    METRO_FREE(sample);
+    return METRO_OK;
+}
+
+static metro_result metroi_path_merge(uint64_t job, const void *slot, void *user)
+{
+    const metroi_path_plan *plan = (const metroi_path_plan *)user;
+    const metroi_log *log = (const metroi_log *)slot;
+    if (plan->look != NULL) plan->look(log, plan->user);
+    metroi_canvas_add(plan->canvas, log, (size_t)(job / plan->jobs) % plan->canvas->batches);
+    return METRO_OK;
+}
+
+/* Round number `round`. */
+static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
+{
+    metro_rounds rounds;
+    memset(&rounds, 0, sizeof rounds);
+    plan->jobs = metroi_path_jobs(plan->canvas->width * plan->canvas->height);
+    rounds.jobs = METROI_ROUND_JOBS;
+    rounds.rounds = plan->jobs / METROI_ROUND_JOBS;
+    rounds.first_round = round * rounds.rounds;
+    rounds.slot_size = metroi_log_size(METROI_JOB_PIXELS * metroi_sample_room(&plan->tracer));
+    rounds.threads = plan->threads;
+    rounds.work = metroi_path_work;
+    rounds.merge = metroi_path_merge;
+    return metro_rounds_run(&rounds, plan);
+}
+
+/* # 13 Metropolis light
+
+   The paths of chapter 12 become states of the chain of chapter 4. The integrand is the picture, a vector with three
+   numbers for each pixel; a path contributes to one pixel, or, when several of its ways reach the film, to a few. The
+   importance of a path is one number, the luminance of all that it contributes, and then (eq 4.1) each sample adds
+   b f/I to the picture: of luminance b, wherever it falls. What a chain does not know is b; and, like any chain, it
+   remembers its start. */
+
+/* # 13.1 The paper's state
+
+   A state is a position on the film, a point on a lamp, and the directions of both walks: points of the unit square,
+   of the unit square and of the sphere, in the frame of the world. Each is measured so that its total is 1, a
+   direction by d omega/(4 pi). With K edges at most there are K - 1 directions for the walk from the eye and K - 1
+   for the walk from the lamp; a path that ends early, in a lamp or because a direction points into a surface, does
+   not use the rest, and they stay in the state for the next one.
+
+   The integrand joins all points of both walks. For the weights of section 12.3 only the densities matter, and here
+   all directions are drawn with the density 1/(4 pi), whatever the surface: each step of eq 12.2 multiplies alpha by
+
+       alpha_{i+1} = alpha_i 4 pi f cos(theta)                                        (13.1)
+
+   and the densities of eq 12.4 become cos(theta)/(4 pi d^2) from both sides. That is all; a uniform state then has
+   the mean importance b, which the tests check. A chain that starts well finds for itself what a walk of chapter 12
+   knows beforehand: that directions below a surface are useless, and those towards the light are not.
+
+   The mutation is an angular perturbation: a uniform direction of a cone about the old one, of all directions at once
+   or of one of them. The paper's size is the apex angle, the full angle of the cone. The position on the film moves
+   by up to half the apex angle as well, as seen from the eye; the point of the lamp, which has no angle, moves by the
+   same share of its square as the cone has of a straight angle. Film and lamp are intervals with reflecting ends.
+
+   The geometry of the paper's scenes was not published. The Cornell box stands in for its homogeneous scene, and a
+   room whose lamp shines from behind a door for the one with difficult lighting. Where a lamp is in the picture every
+   state can be joined to it, so no state is dark and most mutations are accepted, whatever the walks do: studies of
+   the bias leave out paths of one edge.
+
+   [figure: fig4.svg | The error against samples per pixel for apex angles from .05 to .6 rad, and the reference
+   picture (figure 4 of the paper).]
+
+   [figure: fig5.svg | Pictures after 20, 80 and 320 samples per pixel with apex angles of .05, .15 and .45 rad
+   (figure 5 of the paper).]
+
+   [figure: bias.svg | How much of the error is start-up bias: squared bias and variance over independent repeats, for
+   three angles and all policies.]
+
+   [figure: decay.svg | How fast a chain of directions forgets: predicted by the spectrum of the cone, and measured.]
+
+   The importance need not be the luminance. A blue path of the same radiance as a green one has a tenth of its
+   luminance, is sampled as much less often, and is noisier; the largest channel treats them alike.
+
+   [figure: colours.svg | The error of each colour when importance is the luminance, and when it is the largest
+   channel.] */
+
+enum { METROI_LARGEST_CHAINS = 4096, METROI_TRACE_DRAWS = 64, METROI_TRACE_BLOCKS = 17, METROI_PILOT_ROUNDS = 2 };
+
+typedef struct {
+    int s, t;
+    double until; /* running sum of the probabilities, the last one 1 */
+    double share; /* the probability */
+} metroi_way;
+
+typedef struct metroi_walker metroi_walker;
+
+/* What all chains of a render share. */
+typedef struct {
+    metroi_tracer tracer;
+    metroi_canvas *canvas;
+    const metro_render_options *options;
+    metro_axis *axis;
+    size_t axis_count;
+    metroi_way *way;         /* [way_count]: the ways of a state that makes one, else NULL */
+    size_t way_count;
+    double *pilot;           /* [pixels]: the luminance of a blurred pilot picture over its mean, or NULL */
+    double pilot_mean, pilot_error;
+    metroi_walker *walker;   /* [options->chains] */
+    size_t alive;            /* chains that found a start */
+    size_t group_steps, groups; /* a round is `groups` times `group_steps` steps of each chain */
+    double *trace;           /* [chains * METROI_TRACE_BLOCKS * METROI_TRACE_DRAWS]: luminance of blocks over time */
+    double *draws;           /* [chains * METROI_TRACE_DRAWS]: one block of it */
+    size_t trace_count, trace_fill, trace_span;
+    double steps;            /* of each chain so far */
+    uint64_t key;
+} metroi_metropolis;
+
+/* One chain, and where it writes. */
+struct metroi_walker {
+    metroi_metropolis *plan;
+    metro_chain chain;
+    metroi_log *log;           /* of the job at work */
+    double scale;              /* what its samples count: Veach's weight, or 1 */
+    double luminance;          /* of the last state that was looked at */
+    int independent;           /* states looked at are independent draws */
+    metro_moments brightness;  /* of the luminance of independent draws */
+    uint64_t rays;
+    int alive;
+};
+
+static double metroi_film(double z, double size)
+{
+    double x = z * size;
+    return x < size ? x : nextafter(size, 0);
+}
+
+/* The importance of a sample, and its luminance on the way. */
+
+static double metroi_sample_importance(metroi_walker *walker, metroi_sample *sample)
+{
+    const metroi_metropolis *plan = walker->plan;
+    double importance = 0;
+    size_t i;
+    walker->luminance = 0;
+    for (i = 0; i < sample->count; i++) {
+        metro_vec3 color = sample->splat[i].color;
+        double luminance = metroi_color_luminance(color), value = luminance;
+        if (plan->options->largest_channel) value = metroi_largest_component(color);
+        if (plan->pilot != NULL) value /= plan->pilot[sample->splat[i].pixel]; /* eq 13.3 */
+        walker->luminance += luminance;
+        importance += value;
+    }
+    walker->rays += sample->rays;
+    if (walker->independent) metro_moments_add(&walker->brightness, isfinite(importance) ? walker->luminance : 0);
+    sample->importance = importance;
+    return importance;
+}
+
+static void metroi_sample_record(const void *kept, double weight, void *user)
+{
+    metroi_walker *walker = (metroi_walker *)user;
+    const metroi_sample *sample = (const metroi_sample *)kept;
+    size_t i;
+    weight *= walker->scale / sample->importance; /* eq 4.1 */
+    for (i = 0; walker->log != NULL && i < sample->count; i++) metroi_log_add(walker->log, &sample->splat[i], weight);
+}
+
+/* All ways of the walks that a state describes. */
+
+static double metroi_all_importance(const double *z, void *sample, void *user)
+{
+    metroi_walker *walker = (metroi_walker *)user;
+    const metroi_tracer *tracer = &walker->plan->tracer;
+    metroi_numbers numbers;
+    memset(&numbers, 0, sizeof numbers);
+    numbers.z = z;
+    metroi_trace(tracer, &numbers, metroi_film(z[0], tracer->camera.width), metroi_film(z[1], tracer->camera.height),
+                 (metroi_sample *)sample);
+    return metroi_sample_importance(walker, (metroi_sample *)sample);
+}
+
+static metro_axis metroi_axis_make(metro_axis_kind kind, metro_shape shape, double size, double size_min)
+{
+    metro_axis axis;
+    memset(&axis, 0, sizeof axis);
+    axis.kind = kind;
+    axis.kernel.shape = shape;
+    axis.kernel.size = size;
+    axis.kernel.size_min = size_min;
+    return axis;
+}
+
+static metro_result metroi_angular_axes(metroi_metropolis *plan, double apex, double fov)
+{
+    int depth = plan->tracer.depth;
+    double aspect = plan->tracer.camera.width / plan->tracer.camera.height;
+    double across = 2 * atan(tan(fov / 2) * aspect), along = fov;
+    size_t i;
+    plan->axis_count = 4 + 2 * (size_t)(depth - 1);
+    plan->axis = (metro_axis *)metroi_zeros(plan->axis_count, sizeof *plan->axis);
+    if (plan->axis == NULL) return METRO_ERROR_MEMORY;
+    plan->axis[0] = metroi_axis_make(METRO_INTERVAL, METRO_UNIFORM, apex / across, 0);
+    plan->axis[1] = metroi_axis_make(METRO_INTERVAL, METRO_UNIFORM, apex / along, 0);
+    plan->axis[2] = plan->axis[3] = metroi_axis_make(METRO_INTERVAL, METRO_UNIFORM, apex / METROI_PI, 0);
+    for (i = 4; i < plan->axis_count; i++)
+        plan->axis[i] = metroi_axis_make(METRO_DIRECTION, METRO_UNIFORM, apex / 2, 0);
+    return METRO_OK;
+}
+
+/* One of the directions, the point of the lamp or the position on the film is perturbed, and the rest stay. Each is
+   as likely chosen on the way back, so the ratio of eq 4.2 is 1. */
+
+static double metroi_propose_one(const double *from, double *to, metro_rng *rng, void *user)
+{
+    const metroi_walker *walker = (const metroi_walker *)user;
+    const metro_axis *axis = walker->plan->axis;
+    size_t places = walker->plan->axis_count - 2, place = (size_t)metro_rng_below(rng, places), i;
+    memcpy(to, from, metroi_state_doubles(&walker->chain.target) * sizeof *to);
+    if (place >= 2) {
+        i = 4 + 3 * (place - 2);
+        metroi_direction_perturb(&axis[place + 2].kernel, from + i, to + i, rng);
+        return 1;
+    }
+    for (i = 2 * place; i < 2 * place + 2; i++) to[i] = metro_kernel_reflect_perturb(&axis[i].kernel, from[i], rng);
+    return 1;
+}
+
+/* # 13.2 Primary sample space
+
+   Kelemen et al. (2002) let the chain walk not among directions but among the numbers from which chapter 12 makes
+   them. Numbers that are uniform give directions that suit the surfaces, so the importance is f/p, flatter than f,
+   and any state makes sense. A small step moves each number on its circle by a few hundredths at most, most often by
+   much less: METRO_KELEMEN. A large step draws all numbers afresh, and is the independent sampling of chapter 12.
+
+   A state can make all ways of a path, or only one (Hachisuka, Kaplanyan and Dachsbacher 2014). One more number then
+   chooses the way (s, t), with the probability $q_{s,t}$, and what that way contributes counts
+
+       f = frac{w_s f_{s,t}}{q_{s,t} p_{s,t}}                                         (13.2)
+
+   times. Such a state costs a fraction of the rays, and no sample is spoilt by dark ways beside the bright one. A
+   small step keeps the way and moves only the numbers that it uses; the way, and with it the number of edges, changes
+   with a large step, so a few chains reach all lengths as well as many. */
+
+static metro_result metroi_primary_axes(metroi_metropolis *plan, double step)
+{
+    size_t i, numbers = 4 * (size_t)plan->tracer.depth;
+    plan->axis_count = plan->way != NULL ? numbers + 1 : numbers;
+    plan->axis = (metro_axis *)metroi_zeros(plan->axis_count, sizeof *plan->axis);
+    if (plan->axis == NULL) return METRO_ERROR_MEMORY;
+    for (i = 0; i < plan->axis_count; i++)
+        plan->axis[i] = metroi_axis_make(METRO_CIRCLE, METRO_KELEMEN, step, step / 64);
+    return METRO_OK;
+}
+
+static const metroi_way *metroi_way_choose(const metroi_metropolis *plan, double z)
+{
+    size_t low = 0, high = plan->way_count - 1;
+    while (low < high) {
+        size_t middle = low + (high - low) / 2;
+        if (plan->way[middle].until > z) high = middle;
+        else low = middle + 1;
+    }
+    return &plan->way[low];
+}
+
+/* The one way (s, t) of the path that the numbers describe. */
+
+static void metroi_trace_way(const metroi_tracer *tracer, const metroi_numbers *numbers, double x, double y, int s,
+                             int t, metroi_sample *sample)
+{
+    metroi_walks walks;
+    uint32_t pixel = (uint32_t)y * (uint32_t)tracer->camera.width + (uint32_t)x;
+    metro_vec3 color;
+    sample->count = 0;
+    sample->rays = 0;
+    if (metroi_walk_from_lamp(tracer, numbers, sample, walks.y, s) < s) return;
+    if (metroi_walk_from_eye(tracer, numbers, sample, x, y, walks.z, t) < t) return;
+    if (t == 1) {
+        if (!metroi_join_eye(tracer, sample, &walks.y[s - 1], &walks.z[0], &pixel, &color)) return;
+    } else if (s == 0) color = metroi_join_met(tracer, &walks.z[t - 1]);
+    else color = metroi_join_edge(tracer, sample, &walks.y[s - 1], &walks.z[t - 1]);
+    metroi_sample_add(sample, tracer, pixel, s, t, color);
+}
+
+static double metroi_way_importance(const double *z, void *kept, void *user)
+{
+    metroi_walker *walker = (metroi_walker *)user;
+    const metroi_tracer *tracer = &walker->plan->tracer;
+    const metroi_way *way = metroi_way_choose(walker->plan, z[0]);
+    metroi_sample *sample = (metroi_sample *)kept;
+    metroi_numbers numbers;
+    memset(&numbers, 0, sizeof numbers);
+    numbers.z = z + 1;
+    metroi_trace_way(tracer, &numbers, metroi_film(z[1], tracer->camera.width),
+                     metroi_film(z[2], tracer->camera.height), way->s, way->t, sample);
+    if (sample->count > 0) sample->splat[0].color = metro_scale(sample->splat[0].color, 1 / way->share); /* eq 13.2 */
+    return metroi_sample_importance(walker, sample);
+}
+
+/* Is the pair at `place` one that the way uses? Film, lamp and direction of the lamp come first, then the bounces of
+   the eye at odd places and those of the lamp at even ones. */
+
+static int metroi_way_uses(const metroi_way *way, size_t place)
+{
+    int bounce = (int)((place - 1) / 2);
+    if (place == 0) return way->t >= 2;
+    if (place <= 2) return way->s >= (int)place;
+    return place % 2 == 1 ? bounce <= way->t - 2 : bounce <= way->s - 2;
+}
+
+static double metroi_propose_way(const double *from, double *to, metro_rng *rng, void *user)
+{
+    const metroi_walker *walker = (const metroi_walker *)user;
+    const metroi_metropolis *plan = walker->plan;
+    const metroi_way *way = metroi_way_choose(plan, from[0]);
+    size_t i;
+    to[0] = from[0];
+    for (i = 1; i < plan->axis_count; i++)
+        if (metroi_way_uses(way, (i - 1) / 2)) to[i] = metro_kernel_perturb(&plan->axis[i].kernel, from[i], rng);
+        else to[i] = from[i];
+    return 1;
+}
+
+/* # 13.3 A pilot picture
+
+   A chain whose importance is the luminance spends its samples where the picture is bright, and the eye asks for the
+   same relative error everywhere. So we first trace a small picture by the methods of chapter 12, blur it, and divide
+   the importance by it (Veach 1997, chapter 11, calls this two stages): with the pilot's luminance $P_j$ in pixel
+   j, relative to its mean and not less than a tenth of it,
+
+       I = sum_{j} frac{Y_j}{P_j}                                                     (13.3)
+
+   Any P leaves the picture right, because eq 4.1 divides by I again; a good one makes it evenly noisy. The pilot
+   serves two more ends: its ways show which $q_{s,t}$ of eq 13.2 pay, and its mean is an estimate of b. */
+
+static void metroi_blur_line(const double *from, double *to, size_t count, size_t stride)
+{
+    enum { RADIUS = 4 };
+    size_t i, j;
+    for (i = 0; i < count; i++) {
+        size_t low = i > RADIUS ? i - RADIUS : 0, high = i + RADIUS < count ? i + RADIUS : count - 1;
+        double sum = 0;
+        for (j = low; j <= high; j++) sum += from[j * stride];
+        to[i * stride] = sum / (double)(high - low + 1);
+    }
+}
+
+/* Turns the canvas of the pilot into plan->pilot. */
+
+static metro_result metroi_pilot_picture(metroi_metropolis *plan, const metroi_canvas *canvas)
+{
+    size_t pixels = canvas->width * canvas->height, i;
+    double *line = (double *)metroi_zeros(pixels, sizeof *line), mean = 0;
+    plan->pilot = (double *)metroi_zeros(pixels, sizeof *plan->pilot);
+    if (line == NULL || plan->pilot == NULL) {
+        METRO_FREE(line);
+        return METRO_ERROR_MEMORY;
+    }
+    for (i = 0; i < pixels; i++) {
+        const double *c = canvas->sum + 3 * i;
+        plan->pilot[i] = metro_luminance(c[0], c[1], c[2]);
+        mean += plan->pilot[i] / (double)pixels;
+    }
+    for (i = 0; i < canvas->height; i++)
+        metroi_blur_line(plan->pilot + i * canvas->width, line + i * canvas->width, canvas->width, 1);
+    for (i = 0; i < canvas->width; i++) metroi_blur_line(line + i, plan->pilot + i, canvas->height, canvas->width);
+    for (i = 0; i < pixels; i++) {
+        plan->pilot[i] = mean > 0 ? plan->pilot[i] / mean : 1;
+        if (plan->pilot[i] < 0.1) plan->pilot[i] = 0.1;
+    }
+    METRO_FREE(line);
+    return METRO_OK;
+}
+
+typedef struct {
+    metroi_metropolis *plan;
+    double *share; /* by metroi_way_index */
+} metroi_pilot_ways;
+
+static void metroi_pilot_look(const metroi_log *log, void *user)
+{
+    metroi_pilot_ways *pilot = (metroi_pilot_ways *)user;
+    size_t i;
+    for (i = 0; i < log->count; i++) {
+        const metroi_log_entry *entry = &log->entry[i];
+        double value = metro_luminance((double)entry->color[0], (double)entry->color[1], (double)entry->color[2]);
+        if (pilot->plan->pilot != NULL) value /= pilot->plan->pilot[entry->pixel];
+        pilot->share[metroi_way_index(pilot->plan->tracer.depth, entry->s, entry->t)] += value;
+    }
+}
+
+/* The probabilities of the ways: four fifths in proportion to what the pilot saw of each, and a fifth in equal parts,
+   so that a way the pilot missed is found all the same. */
+
+static void metroi_ways_choose(metroi_metropolis *plan, const double *share)
+{
+    int depth = plan->tracer.depth, k, s;
+    double sum = 0, until = 0;
+    size_t count = 0, i;
+    for (k = plan->tracer.shortest; k <= depth; k++)
+        for (s = 0; s <= k; s++) {
+            plan->way[count].s = s;
+            plan->way[count].t = k + 1 - s;
+            plan->way[count].share = share[metroi_way_index(depth, s, k + 1 - s)];
+            sum += plan->way[count++].share;
+        }
+    plan->way_count = count;
+    for (i = 0; i < count; i++) {
+        plan->way[i].share = (sum > 0 ? 0.8 * plan->way[i].share / sum : 0) + (sum > 0 ? 0.2 : 1) / (double)count;
+        until += plan->way[i].share;
+        plan->way[i].until = until;
+    }
+    plan->way[count - 1].until = 1;
+}
+
+static metro_result metroi_pilot_rounds(metroi_metropolis *plan, metroi_path_plan *paths, metroi_canvas *canvas)
+{
+    const metro_render_options *options = plan->options;
+    metro_result result = METRO_OK;
+    metroi_pilot_ways pilot;
+    double n, mean;
+    int round, depth = plan->tracer.depth;
+    pilot.plan = plan;
+    pilot.share = (double *)metroi_zeros(metroi_way_index(depth, depth + 1, 0), sizeof(double));
+    if (pilot.share == NULL) return METRO_ERROR_MEMORY;
+    paths->look = metroi_pilot_look;
+    paths->user = &pilot;
+    for (round = 0; result == METRO_OK && round < METROI_PILOT_ROUNDS; round++)
+        result = metroi_path_round(paths, (uint64_t)round);
+    n = (double)canvas->samples;
+    mean = canvas->luminance / n;
+    plan->pilot_mean = mean;
+    plan->pilot_error = sqrt((canvas->luminance2 / n - mean * mean) / (n - 1));
+    if (result == METRO_OK && plan->way != NULL) metroi_ways_choose(plan, pilot.share);
+    if (result == METRO_OK && !options->one_stage) result = metroi_pilot_picture(plan, canvas);
+    METRO_FREE(pilot.share);
+    return result;
+}
+
+static metro_result metroi_pilot_run(metroi_metropolis *plan)
+{
+    metroi_canvas canvas;
+    metroi_path_plan paths;
+    size_t ways = (size_t)(plan->tracer.depth + 1) * (size_t)(plan->tracer.depth + 2) / 2;
+    size_t width = plan->canvas->width, height = plan->canvas->height;
+    metro_result result = metroi_canvas_make(width, height, 1, plan->tracer.depth, 0, &canvas);
+    if (result != METRO_OK) return result;
+    if (!plan->options->all_connections) plan->way = (metroi_way *)metroi_zeros(ways, sizeof *plan->way);
+    memset(&paths, 0, sizeof paths);
+    paths.tracer = plan->tracer;
+    paths.tracer.separate = 1;
+    paths.canvas = &canvas;
+    paths.key = metroi_mix(plan->key + 1);
+    paths.even_pairs = METROI_EVEN_PAIRS;
+    paths.threads = plan->options->threads;
+    result = METRO_ERROR_MEMORY;
+    if (plan->options->all_connections || plan->way != NULL) result = metroi_pilot_rounds(plan, &paths, &canvas);
+    metroi_canvas_free(&canvas);
+    return result;
+}
+
+/* # 13.4 Chains in rounds
+
+   Each chain is a job (section 1.3), and goes on where its last job ended. A round makes on average one mutation a
+   pixel; it is cut into groups, so that a log stays small. */
+
+static metro_result metroi_walker_start_point(metroi_walker *walker, uint64_t index)
+{
+    const metroi_metropolis *plan = walker->plan;
+    metro_rng rng = metro_rng_make(plan->options->start_seed, index);
+    double *z = (double *)METRO_MALLOC(metroi_state_doubles(&walker->chain.target) * sizeof *z);
+    metro_result result = METRO_ERROR_DARK_SEED;
+    size_t tries;
+    if (z == NULL) return METRO_ERROR_MEMORY;
+    walker->independent = 1;
+    metro_chain_survey(&walker->chain, plan->options->candidates);
+    walker->independent = 0;
+    for (tries = 0; result == METRO_ERROR_DARK_SEED && tries < 64 * plan->options->candidates; tries++) {
+        metroi_state_draw(&walker->chain.target, z, &rng);
+        result = metro_chain_start_point(&walker->chain, z);
+    }
+    METRO_FREE(z);
+    return result == METRO_ERROR_DARK_SEED ? METRO_ERROR_NO_IMPORTANCE : result;
+}
+
+/* A start from seeds takes up to 64 times as many candidates before it gives up. One from weighted seeds may not: the
+   estimate 0 belongs to the mean. */
+
+static metro_result metroi_walker_start_seeds(metroi_walker *walker)
+{
+    const metro_render_options *options = walker->plan->options;
+    int tries = options->start == METRO_START_SEEDS ? 64 : 1;
+    metro_result result = METRO_ERROR_NO_IMPORTANCE;
+    walker->independent = 1;
+    while (result == METRO_ERROR_NO_IMPORTANCE && tries-- > 0)
+        result = metro_chain_start_weighted(&walker->chain, options->candidates);
+    walker->independent = 0;
+    return result;
+}
+
+static metro_result metroi_start_work(uint64_t job, void *slot, void *user)
+{
+    metroi_metropolis *plan = (metroi_metropolis *)user;
+    metroi_walker *walker = &plan->walker[job];
+    const metro_render_options *options = plan->options;
+    metro_chain_options chain_options;
+    metro_target target;
+    metro_result result;
+    (void)slot;
+    memset(&target, 0, sizeof target);
+    target.axes = plan->axis;
+    target.axis_count = plan->axis_count;
+    target.sample_size = metroi_sample_size(&plan->tracer);
+    target.importance = plan->way != NULL ? metroi_way_importance : metroi_all_importance;
+    target.record = metroi_sample_record;
+    target.propose = plan->way != NULL ? metroi_propose_way : options->one_direction ? metroi_propose_one : NULL;
+    target.user = walker;
+    chain_options.large_step = options->large_step;
+    chain_options.expected_values = 1;
+    walker->plan = plan;
+    walker->scale = 1;
+    result = metro_chain_make(&target, &chain_options, metro_rng_make(plan->key, job), &walker->chain);
+    if (result != METRO_OK) return result;
+    if (options->start == METRO_START_POINT) result = metroi_walker_start_point(walker, job);
+    else result = metroi_walker_start_seeds(walker);
+    walker->alive = result == METRO_OK;
+    if (options->start == METRO_START_WEIGHTED) walker->scale = walker->chain.start_weight;
+    return result == METRO_ERROR_NO_IMPORTANCE ? METRO_OK : result;
+}
+
+static metro_result metroi_walk_work(uint64_t job, void *slot, void *user)
+{
+    metroi_metropolis *plan = (metroi_metropolis *)user;
+    metroi_walker *walker = &plan->walker[job % plan->options->chains];
+    metro_chain *chain = &walker->chain;
+    size_t i;
+    if (!walker->alive) return METRO_OK;
+    walker->log = (metroi_log *)slot;
+    walker->rays = 0;
+    for (i = 0; i < plan->group_steps; i++) {
+        uint64_t large = chain->counts.large_steps;
+        metro_chain_step(chain);
+        if (chain->counts.large_steps > large) metro_moments_add(&walker->brightness, walker->luminance);
+    }
+    metro_chain_flush(chain);
+    if (!(plan->options->large_step > 0)) { /* b has no other source: one draw for sixteen mutations */
+        walker->independent = 1;
+        metro_chain_survey(chain, (plan->group_steps + 15) / 16);
+        walker->independent = 0;
+    }
+    walker->log->samples = plan->group_steps;
+    walker->log->rays = walker->rays;
+    walker->log = NULL;
+    return METRO_OK;
+}
+
+/* The luminance of sixteen blocks of the picture and of the whole, chain by chain and group by group, is what R-hat
+   and ESS are computed from. When 64 draws are full, neighbours are added up, and draws become twice as long. */
+
+static void metroi_trace_add(metroi_metropolis *plan, size_t chain, const metroi_log *log)
+{
+    const metroi_canvas *canvas = plan->canvas;
+    double *trace = plan->trace + chain * METROI_TRACE_BLOCKS * METROI_TRACE_DRAWS + plan->trace_count;
+    double scale = plan->walker[chain].scale > 0 ? plan->walker[chain].scale : 1; /* weights are no disagreement */
+    size_t i;
+    for (i = 0; i < log->count; i++) {
+        const metroi_log_entry *entry = &log->entry[i];
+        size_t x = entry->pixel % canvas->width * 4 / canvas->width;
+        size_t y = entry->pixel / canvas->width * 4 / canvas->height;
+        double value = metro_luminance((double)entry->color[0], (double)entry->color[1], (double)entry->color[2]);
+        trace[(4 * y + x) * METROI_TRACE_DRAWS] += value / scale;
+        trace[16 * METROI_TRACE_DRAWS] += value / scale;
+    }
+}
+
+static void metroi_trace_next(metroi_metropolis *plan)
+{
+    size_t i, lines = plan->options->chains * METROI_TRACE_BLOCKS, half = METROI_TRACE_DRAWS / 2;
+    if (++plan->trace_fill < plan->trace_span) return;
+    plan->trace_fill = 0;
+    if (++plan->trace_count < METROI_TRACE_DRAWS) return;
+    for (i = 0; i < lines; i++) {
+        double *draw = plan->trace + i * METROI_TRACE_DRAWS;
+        size_t j;
+        for (j = 0; j < half; j++) draw[j] = draw[2 * j] + draw[2 * j + 1];
+        memset(draw + half, 0, half * sizeof *draw);
+    }
+    plan->trace_count = half;
+    plan->trace_span *= 2;
+}
+
+static metro_result metroi_walk_merge(uint64_t job, const void *slot, void *user)
+{
+    metroi_metropolis *plan = (metroi_metropolis *)user;
+    size_t chain = (size_t)(job % plan->options->chains);
+    metroi_trace_add(plan, chain, (const metroi_log *)slot);
+    metroi_canvas_add(plan->canvas, (const metroi_log *)slot, chain);
+    if (chain + 1 == plan->options->chains) metroi_trace_next(plan);
+    return METRO_OK;
+}
+
+static metro_result metroi_chains_start(metroi_metropolis *plan)
+{
+    metro_rounds rounds;
+    metro_result result;
+    size_t i;
+    for (i = 0; i < plan->options->chains; i++) { /* what an earlier start that failed has left */
+        metro_chain_free(&plan->walker[i].chain);
+        memset(&plan->walker[i], 0, sizeof plan->walker[i]);
+    }
+    plan->alive = 0;
+    memset(&rounds, 0, sizeof rounds);
+    rounds.jobs = plan->options->chains;
+    rounds.threads = plan->options->threads;
+    rounds.work = metroi_start_work;
+    result = metro_rounds_run(&rounds, plan);
+    for (i = 0; i < plan->options->chains; i++) plan->alive += plan->walker[i].alive ? 1u : 0u;
+    if (result == METRO_OK && plan->alive == 0) result = METRO_ERROR_NO_IMPORTANCE;
+    return result;
+}
+
+static metro_result metroi_chains_round(metroi_metropolis *plan, uint64_t round)
+{
+    metro_rounds rounds;
+    metro_result result;
+    memset(&rounds, 0, sizeof rounds);
+    rounds.jobs = plan->options->chains;
+    rounds.rounds = plan->groups;
+    rounds.first_round = round * rounds.rounds;
+    rounds.slot_size = metroi_log_size(2 * (plan->group_steps + 1) * metroi_sample_room(&plan->tracer));
+    rounds.threads = plan->options->threads;
+    rounds.work = metroi_walk_work;
+    rounds.merge = metroi_walk_merge;
+    result = metro_rounds_run(&rounds, plan);
+    if (result == METRO_OK) plan->steps += (double)(plan->groups * plan->group_steps);
+    return result;
+}
+
+static void metroi_chains_free(metroi_metropolis *plan)
+{
+    size_t i;
+    for (i = 0; plan->walker != NULL && i < plan->options->chains; i++) metro_chain_free(&plan->walker[i].chain);
+    METRO_FREE(plan->walker);
+    METRO_FREE(plan->axis);
+    METRO_FREE(plan->way);
+    METRO_FREE(plan->pilot);
+    METRO_FREE(plan->trace);
+    METRO_FREE(plan->draws);
+}
+
+/* The pilot, the axes and the memory of all chains; they start with the first round. */
+
+static metro_result metroi_chains_make(metroi_metropolis *plan, double fov)
+{
+    const metro_render_options *options = plan->options;
+    size_t pixels = plan->canvas->width * plan->canvas->height;
+    size_t steps = (pixels + options->chains - 1) / options->chains;
+    metro_result result = METRO_OK;
+    plan->groups = (steps + 1023) / 1024;
+    plan->group_steps = (steps + plan->groups - 1) / plan->groups;
+    plan->trace_span = 1;
+    plan->walker = (metroi_walker *)metroi_zeros(options->chains, sizeof *plan->walker);
+    plan->trace = (double *)metroi_zeros(options->chains * METROI_TRACE_BLOCKS, METROI_TRACE_DRAWS * sizeof(double));
+    plan->draws = (double *)metroi_zeros(options->chains, METROI_TRACE_DRAWS * sizeof(double));
+    if (plan->walker == NULL || plan->trace == NULL || plan->draws == NULL) return METRO_ERROR_MEMORY;
+    if (options->method == METRO_MLT) return metroi_angular_axes(plan, options->perturbation, fov);
+    if (!options->all_connections || !options->one_stage) result = metroi_pilot_run(plan);
+    return result == METRO_OK ? metroi_primary_axes(plan, options->perturbation) : result;
+}
+
+/* # 13.5 How bright
+
+   b is the mean of the importance over independent states, and there is no end of them: the candidates of the starts,
+   and every large step of every chain, whose importance is known because the chain had to weigh it. So b is not
+   frozen when the chains start; it gets better as long as they run, and states its error. With a pilot the mean
+   luminance is estimated in the same way, and the pilot's own estimate joins in, weighted by its error. */
+
+static void metroi_moments_join(metro_moments *to, const metro_moments *from)
+{
+    double n = (double)to->count, m = (double)from->count, a, b, deviation;
+    double scale = to->scale > from->scale ? to->scale : from->scale;
+    if (from->count == 0) return;
+    a = scale > 0 ? to->scale / scale : 1;
+    b = scale > 0 ? from->scale / scale : 1;
+    deviation = b * from->mean - a * to->mean;
+    to->squares = a * a * to->squares + b * b * from->squares + deviation * deviation * n * m / (n + m);
+    to->mean = a * to->mean + deviation * m / (n + m);
+    to->count += from->count;
+    to->scale = scale;
+}
+
+static void metroi_chains_moments(const metroi_metropolis *plan, metro_moments *importance, metro_moments *luminance)
+{
+    size_t i;
+    memset(importance, 0, sizeof *importance);
+    memset(luminance, 0, sizeof *luminance);
+    for (i = 0; i < plan->options->chains; i++) {
+        metroi_moments_join(importance, &plan->walker[i].chain.normalisation);
+        metroi_moments_join(luminance, &plan->walker[i].brightness);
+    }
+}
+
+/* The mean luminance of the picture: from the pilot and all independent draws. With Veach's weights (eq 4.6) it needs
+   no b, and its error is the spread over the chains. */
+
+static double metroi_canvas_luminance(const metroi_canvas *canvas, size_t batch)
+{
+    size_t i, blocks = canvas->columns * canvas->rows;
+    metro_sum sum = { 0, 0 };
+    for (i = 0; i < blocks; i++) metro_sum_add(&sum, canvas->block[batch * blocks + i]);
+    return metro_sum_value(&sum);
+}
+
+static double metroi_weighted_mean(const metroi_metropolis *plan, double *error)
+{
+    metro_moments chains;
+    size_t c;
+    memset(&chains, 0, sizeof chains);
+    for (c = 0; c < plan->options->chains; c++)
+        metro_moments_add(&chains, metroi_canvas_luminance(plan->canvas, c) / plan->steps);
+    *error = metro_moments_error(&chains);
+    return metro_moments_mean(&chains);
+}
+
+static double metroi_chains_mean(const metroi_metropolis *plan, double *error)
+{
+    metro_moments importance, luminance;
+    double mean, weight = 0;
+    if (plan->options->start == METRO_START_WEIGHTED) return metroi_weighted_mean(plan, error);
+    metroi_chains_moments(plan, &importance, &luminance);
+    mean = metro_moments_mean(&luminance);
+    *error = metro_moments_error(&luminance);
+    if (plan->pilot_error > 0 && *error > 0) {
+        weight = *error * *error / (*error * *error + plan->pilot_error * plan->pilot_error);
+        mean += weight * (plan->pilot_mean - mean);
+        *error *= sqrt(1 - weight);
+    }
+    return mean;
+}
+
+/* # 13.6 One call for all methods
+
+   What a render needs is made at once; then it goes on round by round, and can be looked at after each.
+
+   [figure: costs.svg | Error against time for all methods, on a room with a lamp in sight and one with a hidden
+   lamp.] */
+
+typedef struct {
+    metroi_surface *surface;
+    metroi_canvas canvas;
+    metroi_path_plan paths;
+    metroi_metropolis chains;
+    metro_render_options options;
+} metroi_render;
+
+static int metroi_render_walks(const metro_render_options *options)
+{
+    return options->method == METRO_MLT || options->method == METRO_PSSMLT;
+}
+
+static metro_render_options metroi_render_defaults(const metro_render_options *given)
+{
+    metro_render_options options;
+    memset(&options, 0, sizeof options);
+    if (given != NULL) options = *given;
+    if (options.width == 0) options.width = 128;
+    if (options.height == 0) options.height = 128;
+    if (options.depth == 0) options.depth = 8;
+    if (options.shortest == 0) options.shortest = 1;
+    if (options.threads == 0) options.threads = metro_core_count();
+    if (options.chains == 0) options.chains = 64;
+    if (options.candidates == 0) options.candidates = 1024;
+    if (options.perturbation == 0) options.perturbation = options.method == METRO_MLT ? 0.3 : 0.02;
+    if (options.large_step == 0 && options.method == METRO_PSSMLT) options.large_step = 0.3;
+    if (options.large_step == -1) options.large_step = 0;
+    return options;
+}
+
+static metro_result metroi_render_check(const metro_scene *scene, const metro_camera *camera,
+                                        const metro_render_options *options)
+{
+    size_t pixels;
+    int fits = metroi_size_multiply(options->width, options->height, &pixels) && pixels <= 0x7fffffff;
+    if (options->method < METRO_BDPT || options->method > METRO_PSSMLT) return METRO_ERROR_ARGUMENT;
+    if (options->heuristic < METRO_POWER || options->heuristic > METRO_UNWEIGHTED) return METRO_ERROR_ARGUMENT;
+    if (options->start < METRO_START_SEEDS || options->start > METRO_START_WEIGHTED) return METRO_ERROR_ARGUMENT;
+    if (scene == NULL || scene->bvh == NULL || metro_camera_check(camera) != METRO_OK) return METRO_ERROR_ARGUMENT;
+    if (options->depth < 1 || options->depth > METRO_DEPTH_MOST) return METRO_ERROR_ARGUMENT;
+    if (options->shortest < 1 || options->shortest > options->depth) return METRO_ERROR_ARGUMENT;
+    if (!(options->large_step >= 0 && options->large_step <= 1)) return METRO_ERROR_ARGUMENT;
+    if (!(options->perturbation > 0 && isfinite(options->perturbation))) return METRO_ERROR_ARGUMENT;
+    if (options->chains > METROI_LARGEST_CHAINS) return METRO_ERROR_ARGUMENT;
+    if (!fits) return METRO_ERROR_ARGUMENT;
+    return scene->light_count > 0 ? METRO_OK : METRO_ERROR_NO_LIGHT;
+}
+
+static metroi_tracer metroi_tracer_make(const metro_scene *scene, const metro_camera *camera,
+                                        const metro_render_options *options, const metroi_surface *surface)
+{
+    metroi_tracer tracer;
+    memset(&tracer, 0, sizeof tracer);
+    tracer.scene = scene;
+    tracer.surface = surface;
+    tracer.camera = metroi_camera_make(camera, options->width, options->height);
+    tracer.depth = options->depth;
+    tracer.shortest = options->shortest;
+    tracer.from_eye = options->method != METRO_LIGHT;
+    tracer.from_lamp = options->method != METRO_PATH;
+    tracer.uniform_directions = options->method == METRO_MLT; /* eq 13.1 */
+    tracer.one_connection = options->one_connection && options->method == METRO_BDPT;
+    tracer.separate = options->pyramid && options->method == METRO_BDPT;
+    tracer.heuristic = options->heuristic;
+    return tracer;
+}
+
+static void metroi_render_free(metroi_render *state)
+{
+    metroi_chains_free(&state->chains);
+    metroi_canvas_free(&state->canvas);
+    METRO_FREE(state->surface);
+    METRO_FREE(state);
+}
+
+METRO_API void metro_render_free(metro_render *render)
+{
+    if (render->state != NULL) metroi_render_free((metroi_render *)render->state);
+    memset(render, 0, sizeof *render);
+}
+
+static metro_result metroi_render_fill(metroi_render *state, const metro_scene *scene, const metro_camera *camera,
+                                       const metro_render_options *options)
+{
+    size_t i, batches = metroi_render_walks(options) ? options->chains : (size_t)METROI_PATH_BATCHES;
+    uint64_t key = metroi_mix(options->seed ^ metroi_mix(options->part));
+    metro_result result;
+    state->surface = (metroi_surface *)metroi_zeros(scene->material_count + 1, sizeof *state->surface);
+    if (state->surface == NULL) return METRO_ERROR_MEMORY;
+    for (i = 0; i <= scene->material_count; i++) {
+        state->surface[i] = metroi_surface_make(metro_scene_material(scene, (uint32_t)i));
+    }
+    result = metroi_canvas_make(options->width, options->height, batches, options->depth,
+                                options->pyramid && options->method == METRO_BDPT, &state->canvas);
+    if (result != METRO_OK) return result;
+    state->paths.tracer = state->chains.tracer = metroi_tracer_make(scene, camera, options, state->surface);
+    state->paths.canvas = state->chains.canvas = &state->canvas;
+    state->paths.key = state->chains.key = key;
+    state->paths.even_pairs = options->random_numbers ? 0 : METROI_EVEN_PAIRS;
+    state->paths.threads = options->threads;
+    state->options = *options;
+    state->chains.options = &state->options;
+    if (!metroi_render_walks(options)) return METRO_OK;
+    return metroi_chains_make(&state->chains, camera->fov * METROI_PI / 180);
+}
+
+METRO_API metro_result metro_render_make(const metro_scene *scene, const metro_camera *camera,
+                                         const metro_render_options *options, metro_render *render)
+{
+    metro_render_options filled = metroi_render_defaults(options);
+    metro_result result = metroi_render_check(scene, camera, &filled);
+    metroi_render *state;
+    if (result != METRO_OK) return result;
+    state = (metroi_render *)metroi_zeros(1, sizeof *state);
+    if (state == NULL) return METRO_ERROR_MEMORY;
+    result = metroi_render_fill(state, scene, camera, &filled);
+    if (result != METRO_OK) {
+        metroi_render_free(state);
+        return result;
+    }
+    memset(render, 0, sizeof *render);
+    render->scene = scene;
+    render->options = filled;
+    render->state = state;
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_render_run(metro_render *render, uint64_t rounds,
+                                        int (*stop)(const metro_render *render, void *user), void *user)
+{
+    metroi_render *state = (metroi_render *)render->state;
+    uint64_t i;
+    if (state == NULL) return METRO_ERROR_ARGUMENT;
+    for (i = 0; i < rounds; i++) {
+        metro_result result = METRO_OK;
+        if (!metroi_render_walks(&render->options)) result = metroi_path_round(&state->paths, render->rounds);
+        else {
+            if (render->rounds == 0) result = metroi_chains_start(&state->chains);
+            if (result == METRO_OK) result = metroi_chains_round(&state->chains, render->rounds);
+        }
+        if (result != METRO_OK) return result;
+        render->rounds++;
+        render->samples = state->canvas.samples;
+        render->rays = state->canvas.rays;
+        if (stop != NULL && stop(render, user)) return METRO_ERROR_STOPPED;
+    }
+    return METRO_OK;
+}
+
+/* What turns the sums of the canvas into radiance. */
+
+/* Chains: the picture gets the mean luminance that section 13.5 found. Where the importance is the luminance, this is
+   eq 4.1 with the best b known. */
+
+static double metroi_chains_scale(const metroi_metropolis *plan)
+{
+    const metroi_canvas *canvas = plan->canvas;
+    double pixels = (double)canvas->width * (double)canvas->height, error, total = 0;
+    size_t c;
+    for (c = 0; c < canvas->batches; c++) total += metroi_canvas_luminance(canvas, c);
+    return total > 0 ? pixels * metroi_chains_mean(plan, &error) / total : 0;
+}
+
+static double metroi_render_scale(const metro_render *render)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    if (!metroi_render_walks(&render->options)) return 1 / (double)render->rounds;
+    return metroi_chains_scale(&state->chains);
+}
+
+static metro_result metroi_render_picture(const metro_render *render, const double *sum, metro_image *image)
+{
+    size_t i, count = 3 * render->options.width * render->options.height;
+    double scale = metroi_render_scale(render);
+    metro_image made;
+    metro_result result = metro_image_make(render->options.width, render->options.height, 3, &made);
+    if (result != METRO_OK) return result;
+    for (i = 0; i < count; i++) made.value[i] = sum[i] * scale;
+    *image = made;
+    return METRO_OK;
+}
+
+METRO_API metro_result metro_render_image(const metro_render *render, metro_image *image)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    if (state == NULL || render->rounds == 0) return METRO_ERROR_ARGUMENT;
+    return metroi_render_picture(render, state->canvas.sum, image);
+}
+
+METRO_API metro_result metro_render_way(const metro_render *render, int s, int t, metro_image *image)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    size_t pixels = render->options.width * render->options.height;
+    if (state == NULL || render->rounds == 0 || state->canvas.way == NULL) return METRO_ERROR_ARGUMENT;
+    if (s < 0 || t < 1 || s + t < 2 || s + t > render->options.depth + 1) return METRO_ERROR_ARGUMENT;
+    return metroi_render_picture(
+        render, state->canvas.way + 3 * pixels * metroi_way_index(render->options.depth, s, t), image);
+}
+
+/* # 13.7 Errors that can be believed
+
+   The chains are independent, so what they say of a block of pixels is a sample of as many numbers, and the error of
+   their mean follows from their spread, whatever the correlation along each chain. For a picture that is scaled to
+   its mean luminance it is the spread of the ratios that counts: with block B_c and total T_c of chain c and R = sum
+   B / sum T,
+
+       "Var"(R) ~ frac{1}{C (C - 1)} sum_{c} frac{(B_c - R T_c)^2}{m^2}, m = frac{1}{C} sum_{c} T_c         (13.4)
+
+   The relative error of the mean luminance is common to all blocks, and adds to it. Veach's weights need no scaling,
+   and the other methods have groups of rounds in place of chains: there B_c is compared with its own mean. */
+
+typedef struct {
+    size_t left, right, top, bottom; /* in blocks of 8 x 8 pixels; right and bottom are outside */
+} metroi_window;
+
+static double metroi_window_sum(const metroi_canvas *canvas, const metroi_window *window, size_t batch)
+{
+    size_t x, y;
+    double sum = 0;
+    for (y = window->top; y < window->bottom; y++)
+        for (x = window->left; x < window->right; x++)
+            sum += canvas->block[(batch * canvas->rows + y) * canvas->columns + x];
+    return sum;
+}
+
+/* What batch c should have seen of a window that all batches together saw `sum` of; NaN if it did not run. */
+static double metroi_window_expect(const metro_render *render, size_t c, double sum, double total)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    const metroi_canvas *canvas = &state->canvas;
+    uint64_t rounds = render->rounds / canvas->batches + (c < render->rounds % canvas->batches ? 1u : 0u);
+    if (!metroi_render_walks(&render->options))
+        return rounds > 0 ? sum * (double)rounds / (double)render->rounds : METROI_NAN;
+    if (render->options.start == METRO_START_WEIGHTED) return sum / (double)canvas->batches;
+    return state->chains.walker[c].alive ? sum / total * metroi_canvas_luminance(canvas, c) : METROI_NAN;
+}
+
+static double metroi_common_error(const metro_render *render)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    double mean, error;
+    if (!metroi_render_walks(&render->options) || render->options.start == METRO_START_WEIGHTED) return 0;
+    mean = metroi_chains_mean(&state->chains, &error);
+    return error / mean;
+}
+
+/* The sum over the window and its relative standard error; NaN when fewer than two batches have run. */
+static double metroi_window_error(const metro_render *render, const metroi_window *window, double *error)
+{
+    const metroi_canvas *canvas = &((const metroi_render *)render->state)->canvas;
+    double sum = 0, total = 0, spread = 0, used = 0, common = metroi_common_error(render);
+    size_t c;
+    for (c = 0; c < canvas->batches; c++) {
+        sum += metroi_window_sum(canvas, window, c);
+        total += metroi_canvas_luminance(canvas, c);
+    }
+    for (c = 0; c < canvas->batches; c++) {
+        double off = metroi_window_sum(canvas, window, c) - metroi_window_expect(render, c, sum, total);
+        if (isnan(off)) continue;
+        spread += off * off;
+        used++;
+    }
+    *error = used > 1 ? sqrt(spread * used / (used - 1) / (sum * sum) + common * common) : METROI_NAN; /* eq 13.4 */
+    return sum;
+}
+
+METRO_API double metro_render_block(const metro_render *render, size_t column, size_t row, double *error)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    const metroi_canvas *canvas;
+    metroi_window window;
+    size_t width, height;
+    double mean;
+    *error = METROI_NAN;
+    if (state == NULL || render->rounds == 0) return METROI_NAN;
+    canvas = &state->canvas;
+    if (column >= canvas->columns || row >= canvas->rows) return METROI_NAN;
+    window.left = column;
+    window.right = column + 1;
+    window.top = row;
+    window.bottom = row + 1;
+    width = 8 * column + 8 <= canvas->width ? 8 : canvas->width - 8 * column;
+    height = 8 * row + 8 <= canvas->height ? 8 : canvas->height - 8 * row;
+    mean = metroi_window_error(render, &window, error) * metroi_render_scale(render) / (double)(width * height);
+    *error = mean > 0 ? *error * mean : METROI_NAN; /* a block that no sample fell on says nothing of its error */
+    return mean;
+}
+
+/* The relative error of the mean luminance of a method without chains: the spread over the groups of rounds, or,
+   while there are few rounds, that over all samples, which counts the differences between pixels as well. */
+
+static double metroi_paths_error(const metro_render *render)
+{
+    const metroi_canvas *canvas = &((const metroi_render *)render->state)->canvas;
+    double n = (double)canvas->samples, mean = canvas->luminance / n, error;
+    metroi_window all;
+    all.left = all.top = 0;
+    all.right = canvas->columns;
+    all.bottom = canvas->rows;
+    metroi_window_error(render, &all, &error);
+    if (render->rounds >= canvas->batches) return error;
+    return sqrt((canvas->luminance2 / n - mean * mean) / (n - 1)) / mean;
+}
+
+/* The largest relative error of the sixteenths of the picture. */
+static double metroi_worst_window(const metro_render *render)
+{
+    const metroi_canvas *canvas = &((const metroi_render *)render->state)->canvas;
+    double worst = METROI_NAN, error;
+    size_t i;
+    for (i = 0; i < 16; i++) {
+        metroi_window window;
+        window.left = i % 4 * canvas->columns / 4;
+        window.right = (i % 4 + 1) * canvas->columns / 4;
+        window.top = i / 4 * canvas->rows / 4;
+        window.bottom = (i / 4 + 1) * canvas->rows / 4;
+        if (metroi_window_error(render, &window, &error) > 0 && !(error <= worst)) worst = error;
+    }
+    return worst;
+}
+
+/* R-hat and ESS (sections 7.7 and 7.8) are taken of sixteenths of the picture as well, and of the whole. */
+
+static void metroi_chains_diagnose(const metroi_metropolis *plan, metro_render_report *report)
+{
+    size_t chains = plan->options->chains, block, c, draws = plan->trace_count, i;
+    for (block = 0; draws >= 4 && block < METROI_TRACE_BLOCKS; block++) {
+        double rhat, ess;
+        for (c = 0; c < chains; c++)
+            for (i = 0; i < draws; i++)
+                plan->draws[c * draws + i] = plan->trace[(c * METROI_TRACE_BLOCKS + block) * METROI_TRACE_DRAWS + i];
+        rhat = metro_rhat(plan->draws, chains, draws);
+        ess = metro_ess(plan->draws, chains, draws);
+        if (!(report->rhat >= rhat) && !isnan(rhat)) report->rhat = rhat;
+        if (!(report->ess <= ess) && !isnan(ess)) report->ess = ess;
+    }
+}
+
+static void metroi_chains_report(const metro_render *render, metro_render_report *report)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    const metroi_metropolis *plan = &state->chains;
+    metro_moments importance, luminance;
+    double steps = 0, accepted = 0, dark = 0, jump = 0;
+    size_t c;
+    metroi_chains_moments(plan, &importance, &luminance);
+    report->b = metro_moments_mean(&importance);
+    report->b_error = metro_moments_error(&importance);
+    for (c = 0; c < plan->options->chains; c++) {
+        const metro_chain_counts *counts = &plan->walker[c].chain.counts;
+        steps += (double)counts->steps;
+        accepted += (double)counts->accepted;
+        dark += (double)counts->dark;
+        jump += metro_sum_value(&counts->squared_jump);
+        report->not_finite += counts->nan + counts->infinite + counts->negative;
+        if (counts->longest_stay > report->longest_stay) report->longest_stay = counts->longest_stay;
+    }
+    report->acceptance = accepted / steps;
+    report->dark = dark / steps;
+    report->squared_jump = jump / steps;
+    metroi_chains_diagnose(plan, report);
+}
+
+/* For a text: what is too large for an int is cut. */
+static int metroi_whole(double x)
+{
+    return x < 1e9 ? (int)x : 1000000000;
+}
+
+/* A warning is the first of these that holds. The bounds are the customary ones: R-hat 1.1, an ESS of 100; a mean
+   known to a twentieth; a twentieth of a chain spent in one state. */
+
+static void metroi_report_warn(const metro_render *render, metro_render_report *report)
+{
+    double steps = (double)render->samples / (double)render->options.chains;
+    double share = report->mean_error / report->mean;
+    char *text = report->warning;
+    size_t room = sizeof report->warning;
+    if (report->not_finite > 0)
+        snprintf(text, room,
+                 "%.0f contributions were NaN or infinite and are missing in the picture: look for triangles or "
+                 "materials with extreme numbers",
+                 (double)report->not_finite);
+    else if (report->mean == 0 && metroi_render_walks(&render->options))
+        snprintf(text, room,
+                 "none of the independent states had any importance, so b is unknown and the picture black: use more "
+                 "candidates or large steps");
+    else if (report->mean == 0)
+        snprintf(text, room,
+                 "no path from a lamp to the eye was found, so the picture is black: use more samples, or check "
+                 "where the lamps shine");
+    else if (metroi_render_walks(&render->options) && render->options.chains < 4)
+        snprintf(text, room, "with fewer than four chains nothing says whether they agree: use more");
+    else if (report->rhat > 1.1)
+        snprintf(text, room,
+                 "the chains do not agree on some part of the picture (R-hat above %d.%d): run longer, or raise the "
+                 "probability of a large step",
+                 metroi_whole(report->rhat), metroi_whole(10 * report->rhat) % 10);
+    else if (report->ess < 100)
+        snprintf(text, room, "some part of the picture rests on as little as %d independent samples: run longer",
+                 metroi_whole(report->ess));
+    else if ((double)report->longest_stay > steps / 20)
+        snprintf(text, room,
+                 "a chain stayed in one state for %.0f of its %.0f steps, which makes a bright spot: run longer, or "
+                 "raise the probability of a large step",
+                 (double)report->longest_stay, steps);
+    else if (isnan(share))
+        snprintf(text, room, "there are too few samples to say how far the picture can be trusted: run longer");
+    else if (!(share < 0.05))
+        snprintf(text, room, "the mean brightness is known to %d %% only: run longer", metroi_whole(100 * share));
+    else if (report->worst > 0.25)
+        snprintf(text, room, "some part of the picture is known to %d %% only: run longer",
+                 metroi_whole(100 * report->worst));
+}
+
+METRO_API void metro_render_diagnose(const metro_render *render, metro_render_report *report)
+{
+    const metroi_render *state = (const metroi_render *)render->state;
+    double n;
+    memset(report, 0, sizeof *report);
+    report->mean = report->mean_error = report->b = report->b_error = METROI_NAN;
+    report->acceptance = report->dark = report->rhat = report->ess = report->worst = METROI_NAN;
+    report->squared_jump = METROI_NAN;
+    if (state == NULL || render->rounds == 0) return;
+    report->not_finite = state->canvas.not_finite;
+    n = (double)state->canvas.samples;
+    if (!metroi_render_walks(&render->options)) {
+        report->mean = state->canvas.luminance / n;
+        report->mean_error = metroi_paths_error(render) * report->mean;
+    } else {
+        metroi_chains_report(render, report);
+        report->mean = metroi_chains_mean(&state->chains, &report->mean_error);
+    }
+    report->worst = metroi_worst_window(render);
+    metroi_report_warn(render, report);
+}
+
+#endif /* METRO_NO_TRACER */
+
 #undef METROI_PI
 #undef METROI_NAN
 #undef METROI_INFINITY
