@@ -85,7 +85,7 @@ references: build/fig2 build/fig5
 	@build/fig2
 	@build/fig5
 	@mkdir -p docs/figures
-	cp out/fig2.svg out/fig5.png docs/figures/
+	cp out/fig2.svg out/fig5.svg docs/figures/
 
 install:
 	install -d $(DESTDIR)$(PREFIX)/include
