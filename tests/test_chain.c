@@ -338,7 +338,7 @@ static double stay_there(const double *from, double *to, metro_rng *rng, void *u
    in single precision that is refused, a space of the target's own that is looked at. */
 static void seeds_outside_the_space_are_refused(void)
 {
-    static const double wrong[9] = { -1e-9, 1, 1.5, -1, (double)NAN, (double)INFINITY, -(double)INFINITY, 3, 1e300 };
+    const double wrong[9] = { -1e-9, 1, 1.5, -1, (double)NAN, (double)INFINITY, -(double)INFINITY, 3, 1e300 };
     int calls = 0, i;
     metro_axis axes[3], circle = axis_of(METRO_CIRCLE, METRO_UNIFORM, .3);
     metro_target target = target_of(axes, 3, anywhere, &calls);

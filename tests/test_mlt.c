@@ -317,11 +317,11 @@ static void perturbation_sizes(void)
             step[2] = fabs(to[2] - z[2]) * CHECK_PI;
             step[3] = fabs(to[3] - z[3]) * CHECK_PI;
             step[4] = 0;
-            if (step[0] > 0) moved[0]++;
+            if (step[0] > 1e-9) moved[0]++; /* the angle of a direction with itself may be a rounding error */
             if (step[2] > 0) moved[1]++;
             for (i = 0; i < 2 * (DEPTH - 1); i++) {
                 double turn = metroi_direction_angle(z + 4 + 3 * i, to + 4 + 3 * i);
-                if (turn > 0) moved[2 + i]++;
+                if (turn > 1e-9) moved[2 + i]++;
                 if (turn > step[4]) step[4] = turn;
             }
             for (i = 0; i < 5; i++)
