@@ -10516,7 +10516,7 @@ METRO_API metro_result metro_scene_parse_obj(metro_scene *scene, const unsigned 
    [1/2, 1); dividing by it rounds nothing. */
 
 typedef struct {
-    float bound[6][8]; /* lower x, y, z, then upper x, y, z, of the eight children */
+    float bound[48]; /* of the eight children in turn: lower x, lower y, lower z, then upper x, y, z */
     uint32_t child[8];
     uint32_t idle[8]; /* to 256 bytes: four lines of the cache, and a shift finds a node */
 } metroi_node;
@@ -10934,8 +10934,8 @@ static void metroi_node_set(metroi_node *node, int slot, const metroi_fork *fork
 {
     int k;
     for (k = 0; k < 3; k++) {
-        node->bound[k][slot] = fork != NULL ? fork->box.lo[k] : (float)METROI_INFINITY;
-        node->bound[k + 3][slot] = fork != NULL ? fork->box.hi[k] : -(float)METROI_INFINITY;
+        node->bound[8 * k + slot] = fork != NULL ? fork->box.lo[k] : (float)METROI_INFINITY;
+        node->bound[8 * k + 24 + slot] = fork != NULL ? fork->box.hi[k] : -(float)METROI_INFINITY;
     }
     node->child[slot] = child;
 }
@@ -11272,7 +11272,7 @@ METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_
     for (i = 0; i < 8; i++) near_t[i] = ray->t_min;
     for (i = 0; i < 8; i++) far_t[i] = ray->t;
     for (k = 0; k < 3; k++) { /* eq 10.5 */
-        const float *near_row = node->bound[0] + ray->near_row[k], *far_row = node->bound[0] + ray->far_row[k];
+        const float *near_row = node->bound + ray->near_row[k], *far_row = node->bound + ray->far_row[k];
         float o = ray->origin[k], r = ray->inverse[k], padded = ray->inverse[k] * METROI_PAD_NODE;
         for (i = 0; i < 8; i++) near_t[i] = metroi_high((near_row[i] - o) * r, near_t[i]);
         for (i = 0; i < 8; i++) far_t[i] = metroi_low((far_row[i] - o) * padded, far_t[i]);
@@ -11521,8 +11521,8 @@ METROI_INLINE unsigned metroi_boxes_four(const metroi_node *node, const metroi_r
                                          float near_t[8])
 {
     const metroi_ray4 *s = (const metroi_ray4 *)spread;
-    unsigned first = metroi_boxes_half(node->bound[0], ray, s, near_t);
-    return first | metroi_boxes_half(node->bound[0] + 4, ray, s, near_t + 4) << 4;
+    unsigned first = metroi_boxes_half(node->bound, ray, s, near_t);
+    return first | metroi_boxes_half(node->bound + 4, ray, s, near_t + 4) << 4;
 }
 
 METROI_INLINE metroi_v4 metroi_v4_shear(const float *row, metroi_v4 origin, metroi_v4 shear, metroi_v4 z)
@@ -11618,7 +11618,7 @@ METROI_AVX2 METROI_INLINE unsigned metroi_boxes_eight(const metroi_node *node, c
 {
     const metroi_ray8 *s = (const metroi_ray8 *)spread;
     const size_t *near_row = s->four.near_row, *far_row = s->four.far_row;
-    const float *row = node->bound[0];
+    const float *row = node->bound;
     __m256 n = _mm256_set1_ps(ray->t_min), f = _mm256_set1_ps(ray->t); /* eq 10.10 */
     n = _mm256_max_ps(metroi_v8_plane(row + near_row[0], s->inverse[0], s->enter[0]), n);
     f = _mm256_min_ps(metroi_v8_plane(row + far_row[0], s->inverse[0], s->leave[0]), f);

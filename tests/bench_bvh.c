@@ -37,10 +37,7 @@ static void add(metro_scene *scene, metro_vec3 a, metro_vec3 b, metro_vec3 c)
     if (metro_scene_add_triangle(scene, p, 0) != METRO_OK) abort();
 }
 
-static double bump(double x, double y)
-{
-    return 0.02 * sin(17 * x + 3 * y) * sin(13 * y - 5 * x);
-}
+static double bump(double x, double y) { return 0.02 * sin(17 * x + 3 * y) * sin(13 * y - 5 * x); }
 
 /* The point at (u, v) in [0,1]^2 of face `face` of the room [-1,1]^3; inside, faces are bumpy when there are many triangles. */
 static metro_vec3 wall_point(int face, int n, int i, int j)
@@ -86,8 +83,8 @@ static void ball(metro_scene *scene, metro_vec3 c, double r, int n)
 
 static void crate(metro_scene *scene, metro_vec3 c, double r, double turn)
 {
-    static const int face[6][4] = { { 0, 1, 3, 2 }, { 4, 6, 7, 5 }, { 0, 4, 5, 1 }, { 2, 3, 7, 6 }, { 0, 2, 6, 4 },
-                                    { 1, 5, 7, 3 } };
+    static const int face[6][4] = { { 0, 1, 3, 2 }, { 4, 6, 7, 5 }, { 0, 4, 5, 1 },
+                                    { 2, 3, 7, 6 }, { 0, 2, 6, 4 }, { 1, 5, 7, 3 } };
     metro_vec3 p[8];
     int i;
     for (i = 0; i < 8; i++) {
@@ -109,14 +106,18 @@ static void room(metro_scene *scene, int size)
     if (size == 0) {
         crate(scene, metro_vec3_make(-0.4, -0.6, -0.3), 0.3, 0.3);
         crate(scene, metro_vec3_make(0.4, -0.7, 0.2), 0.25, 1.0);
-        add(scene, metro_vec3_make(-0.2, 0.99, -0.2), metro_vec3_make(0.2, 0.99, -0.2), metro_vec3_make(0.2, 0.99, 0.2));
-        add(scene, metro_vec3_make(-0.2, 0.99, -0.2), metro_vec3_make(0.2, 0.99, 0.2), metro_vec3_make(-0.2, 0.99, 0.2));
-        add(scene, metro_vec3_make(0, -0.99, -0.9), metro_vec3_make(0.3, -0.5, -0.9), metro_vec3_make(0.2, 0.2, -0.8));
+        add(scene, metro_vec3_make(-0.2, 0.99, -0.2), metro_vec3_make(0.2, 0.99, -0.2),
+            metro_vec3_make(0.2, 0.99, 0.2));
+        add(scene, metro_vec3_make(-0.2, 0.99, -0.2), metro_vec3_make(0.2, 0.99, 0.2),
+            metro_vec3_make(-0.2, 0.99, 0.2));
+        add(scene, metro_vec3_make(0, -0.99, -0.9), metro_vec3_make(0.3, -0.5, -0.9),
+            metro_vec3_make(0.2, 0.2, -0.8));
         add(scene, metro_vec3_make(0.7, -0.99, 0.9), metro_vec3_make(0.9, -0.5, 0.9), metro_vec3_make(0.7, 0.2, 0.8));
     }
     for (i = 0; i < balls[size]; i++) {
         double x = metro_rng_uniform(&rng), y = metro_rng_uniform(&rng), z = metro_rng_uniform(&rng);
-        ball(scene, metro_vec3_make(1.6 * x - 0.8, 1.4 * y - 0.8, 1.3 * z - 0.8), size == 1 ? 0.18 : 0.12, ball_n[size]);
+        ball(scene, metro_vec3_make(1.6 * x - 0.8, 1.4 * y - 0.8, 1.3 * z - 0.8), size == 1 ? 0.18 : 0.12,
+             ball_n[size]);
     }
 }
 
@@ -149,7 +150,8 @@ static void make_rays(const metro_scene *scene, bench_ray *primary, bench_ray *d
     metro_rng rng = metro_rng_make(11, 0);
     int i;
     for (i = 0; i < RAYS; i++) {
-        double x = (i % SIDE + metro_rng_uniform(&rng)) / SIDE * 2 - 1, y = (i / SIDE + metro_rng_uniform(&rng)) / SIDE * 2 - 1;
+        double x = (i % SIDE + metro_rng_uniform(&rng)) / SIDE * 2 - 1,
+               y = (i / SIDE + metro_rng_uniform(&rng)) / SIDE * 2 - 1;
         metro_vec3 d = metro_normalize(metro_vec3_make(0.7 * x, -0.7 * y, -1)), n, p, lamp;
         metro_hit hit;
         ray_set(&primary[i], metro_vec3_make(0.05, 0.05, 0.9), d, 1e30);
@@ -206,7 +208,8 @@ static double embree_turn(RTCScene scene, const bench_ray *ray, int any, double 
     rtcInitIntersectContext(&context);
     for (i = 0; i < RAYS; i++) {
         struct RTCRayHit q;
-        q.ray.org_x = (float)ray[i].origin.x, q.ray.org_y = (float)ray[i].origin.y, q.ray.org_z = (float)ray[i].origin.z;
+        q.ray.org_x = (float)ray[i].origin.x, q.ray.org_y = (float)ray[i].origin.y,
+        q.ray.org_z = (float)ray[i].origin.z;
         q.ray.dir_x = (float)ray[i].direction.x, q.ray.dir_y = (float)ray[i].direction.y;
         q.ray.dir_z = (float)ray[i].direction.z;
         q.ray.tnear = 0, q.ray.tfar = (float)ray[i].t_max, q.ray.time = 0, q.ray.mask = ~0u, q.ray.flags = 0;
@@ -286,10 +289,13 @@ int main(int argc, char **argv)
             const metroi_bvh *b = (const metroi_bvh *)scene[PATHS - 1].bvh;
             const metroi_bvh *b4 = (const metroi_bvh *)scene[1].bvh;
             size_t n = scene[0].triangle_count;
-            printf("room %s: %zu triangles, %.1f / %.1f bytes a triangle (four, eight wide), nodes %zu/%zu, blocks %zu/%zu, build %.2f / %.2f M triangles/s", scene_name[size],
-                   n, 40 + (double)(b4->node_count * sizeof(metroi_node) + b4->block_count * sizeof(metroi_block)) / n,
-                   40 + (double)(b->node_count * sizeof(metroi_node) + b->block_count * sizeof(metroi_block)) / n, b4->node_count, b->node_count,
-                   b4->block_count, b->block_count, 1e-6 * n / build[1], 1e-6 * n / build[2]);
+            printf("room %s: %zu triangles, %.1f / %.1f bytes a triangle (four, eight wide), nodes %zu/%zu, blocks "
+                   "%zu/%zu, build %.2f / %.2f M triangles/s",
+                   scene_name[size], n,
+                   40 + (double)(b4->node_count * sizeof(metroi_node) + b4->block_count * sizeof(metroi_block)) / n,
+                   40 + (double)(b->node_count * sizeof(metroi_node) + b->block_count * sizeof(metroi_block)) / n,
+                   b4->node_count, b->node_count, b4->block_count, b->block_count, 1e-6 * n / build[1],
+                   1e-6 * n / build[2]);
             if (embree_build < 1e9) printf(" (Embree %.2f)", 1e-6 * n / embree_build);
             printf("\n");
         }
@@ -310,8 +316,8 @@ int main(int argc, char **argv)
     }
 #ifndef NO_EMBREE
     for (c = 0; c < PATHS; c++)
-        printf("%s: geometric mean %.3f of Embree's default, %.3f of its robust mode; lowest cell %.2f\n", column_name[c],
-               exp(log_sum[c][0] / (3 * last)), exp(log_sum[c][1] / (3 * last)), lowest[c]);
+        printf("%s: geometric mean %.3f of Embree's default, %.3f of its robust mode; lowest cell %.2f\n",
+               column_name[c], exp(log_sum[c][0] / (3 * last)), exp(log_sum[c][1] / (3 * last)), lowest[c]);
     rtcReleaseDevice(device);
 #endif
     return 0;

@@ -31,10 +31,7 @@ static void add_quad(metro_scene *scene, metro_vec3 a, metro_vec3 b, metro_vec3 
 
 static metro_vec3 vec(double x, double y, double z) { return metro_vec3_make(x, y, z); }
 
-static double uniform(metro_rng *rng, double low, double high)
-{
-    return low + (high - low) * metro_rng_uniform(rng);
-}
+static double uniform(metro_rng *rng, double low, double high) { return low + (high - low) * metro_rng_uniform(rng); }
 
 static metro_vec3 in_box(metro_rng *rng, double r)
 {
@@ -42,14 +39,12 @@ static metro_vec3 in_box(metro_rng *rng, double r)
     return vec(x, y, z);
 }
 
-static metro_vec3 as_float(metro_vec3 a)
-{
-    return vec((double)(float)a.x, (double)(float)a.y, (double)(float)a.z);
-}
+static metro_vec3 as_float(metro_vec3 a) { return vec((double)(float)a.x, (double)(float)a.y, (double)(float)a.z); }
 
 static metro_vec3 ball_point(metro_vec3 c, double r, int n, int i, int j)
 {
-    double a = 3.14159265358979 * i / n, b = 6.28318530717959 * (j % (2 * n)) / (2 * n), s = i == 0 || i == n ? 0 : sin(a);
+    double a = 3.14159265358979 * i / n, b = 6.28318530717959 * (j % (2 * n)) / (2 * n),
+           s = i == 0 || i == n ? 0 : sin(a);
     return metro_add(c, metro_scale(vec(s * cos(b), cos(a), s * sin(b)), r));
 }
 
@@ -95,10 +90,7 @@ static void soup(metro_scene *scene, metro_rng *rng, int count, double size)
     }
 }
 
-static void build(metro_scene *scene)
-{
-    CHECK(metro_scene_build(scene) == METRO_OK, "cannot build");
-}
+static void build(metro_scene *scene) { CHECK(metro_scene_build(scene) == METRO_OK, "cannot build"); }
 
 static metroi_bvh *tree(const metro_scene *scene) { return (metroi_bvh *)scene->bvh; }
 
@@ -111,7 +103,8 @@ static metro_vec3 corner(const metro_scene *scene, uint32_t triangle, int k)
 }
 
 /* Moller and Trumbore in double. `edge` is how far the ray is inside, in barycentric units: negative outside. */
-static int moller_trumbore(const metro_scene *scene, uint32_t triangle, metro_vec3 o, metro_vec3 d, double *t, double *edge)
+static int moller_trumbore(const metro_scene *scene, uint32_t triangle, metro_vec3 o, metro_vec3 d, double *t,
+                           double *edge)
 {
     metro_vec3 p0 = corner(scene, triangle, 0), e1 = metro_subtract(corner(scene, triangle, 1), p0);
     metro_vec3 e2 = metro_subtract(corner(scene, triangle, 2), p0), p = metro_cross(d, e2);
@@ -160,8 +153,8 @@ static int hit_all(const metro_scene *scene, metro_vec3 o, metro_vec3 d, double 
         again = metro_scene_hit(scene, o, d, t_min, t_max, &other);
         any = metro_scene_occluded(scene, o, d, t_min, t_max);
         CHECK(again == found && any == found && (!found || same_hit(hit, &other)),
-              "path %d of %d: %d %d %d, t %.9g or %.9g, triangle %u or %u", path, (int)best, found, again, any, hit->t,
-              other.t, (unsigned)hit->triangle, (unsigned)other.triangle);
+              "path %d of %d: %d %d %d, t %.9g or %.9g, triangle %u or %u", path, (int)best, found, again, any,
+              hit->t, other.t, (unsigned)hit->triangle, (unsigned)other.triangle);
         if (check_global.failures_in_case > 5) break;
     }
     bvh->path = best;
@@ -203,7 +196,8 @@ static void agrees_with_double(void)
             if (!found) continue;
             (void)moller_trumbore(&scene, hit.triangle, o, d, &t, &edge);
             CHECK(edge > -1e-4, "hits triangle %u, which is %g outside", (unsigned)hit.triangle, -edge);
-            CHECK(!sure || hit.t < nearest + 2e-6 * (1 + size[k]) / metro_length(d), "t = %.9g, nearest %.9g", hit.t, nearest);
+            CHECK(!sure || hit.t < nearest + 2e-6 * (1 + size[k]) / metro_length(d), "t = %.9g, nearest %.9g", hit.t,
+                  nearest);
             if (edge > 1e-3) {
                 metro_vec3 p0 = corner(&scene, hit.triangle, 0), p = metro_add(o, metro_scale(d, hit.t)), q;
                 q = metro_add(p0, metro_scale(metro_subtract(corner(&scene, hit.triangle, 1), p0), hit.u));
@@ -252,8 +246,9 @@ static void bits_of_scene(metro_scene *scene, double r, uint64_t rays, uint64_t 
         found = hit_all(scene, o, d, 0, t_max, &hit);
         if (i < loops) {
             int again = loop_hit(scene, o, d, 0, t_max, &other);
-            CHECK(found == again && (!found || same_hit(&hit, &other)), "the loop: %d %d, t %.9g %.9g, triangle %u %u", found,
-                  again, hit.t, other.t, (unsigned)hit.triangle, (unsigned)other.triangle);
+            CHECK(found == again && (!found || same_hit(&hit, &other)),
+                  "the loop: %d %d, t %.9g %.9g, triangle %u %u", found, again, hit.t, other.t,
+                  (unsigned)hit.triangle, (unsigned)other.triangle);
         }
     }
     metro_scene_free(scene);
@@ -332,7 +327,8 @@ static void closed_scenes_do_not_leak(void)
             metro_vec3 o = metro_add(vec(100, 50, -70), in_box(&rng, 0.5));
             metro_hit hit;
             uint32_t triangle = (uint32_t)(metro_rng_uniform(&rng) * (double)scene.triangle_count);
-            if (!metro_scene_hit(&scene, o, metro_subtract(corner(&scene, triangle, 0), o), 0, INFINITY, &hit)) leaks++;
+            if (!metro_scene_hit(&scene, o, metro_subtract(corner(&scene, triangle, 0), o), 0, INFINITY, &hit))
+                leaks++;
         }
         CHECK(leaks == 0, "%g of %g rays leak", (double)leaks, (double)n);
         metro_scene_free(&scene);
@@ -393,14 +389,17 @@ static void bounds_are_strict(void)
         metro_rng rng = metro_rng_make(21, 0);
         uint64_t i, n = check_count(20000, 500);
         for (i = 0; i < n; i++) {
-            metro_vec3 from = in_box(&rng, 0.9), to = metro_subtract(vec(uniform(&rng, -0.9, 0.9), uniform(&rng, -0.9, 0.9), 1), from);
+            metro_vec3 from = in_box(&rng, 0.9),
+                       to = metro_subtract(vec(uniform(&rng, -0.9, 0.9), uniform(&rng, -0.9, 0.9), 1), from);
             double t;
             if (!hit_all(&scene, from, to, 0, INFINITY, &hit)) continue;
             t = hit.t;
             CHECK(!hit_all(&scene, from, to, 0, t, &hit), "t_max is not strict at %.17g", t);
-            CHECK(hit_all(&scene, from, to, 0, nextafter(t, 2), &hit) && hit.t == t, "t_max is too strict at %.17g", t);
+            CHECK(hit_all(&scene, from, to, 0, nextafter(t, 2), &hit) && hit.t == t, "t_max is too strict at %.17g",
+                  t);
             CHECK(!hit_all(&scene, from, to, t, 2, &hit), "t_min is not strict at %.17g", t);
-            CHECK(hit_all(&scene, from, to, nextafter(t, 0), 2, &hit) && hit.t == t, "t_min is too strict at %.17g", t);
+            CHECK(hit_all(&scene, from, to, nextafter(t, 0), 2, &hit) && hit.t == t, "t_min is too strict at %.17g",
+                  t);
         }
     }
     metro_scene_free(&scene);
@@ -416,8 +415,10 @@ static void ties_go_to_the_lowest(void)
         add_quad(&scene, vec(-1, -1, 1), vec(1, -1, 1), vec(1, 1, 1), vec(-1, 1, 1));
     }
     build(&scene);
-    CHECK(hit_all(&scene, vec(0.5, -0.5, 0), vec(0, 0, 1), 0, 9, &hit) && hit.triangle == 1, "%u of equals", (unsigned)hit.triangle);
-    CHECK(hit_all(&scene, vec(0, -0.5, 9), vec(0, 0, -1), 0, 7.5, &hit) && hit.triangle == 0, "%u of equals", (unsigned)hit.triangle);
+    CHECK(hit_all(&scene, vec(0.5, -0.5, 0), vec(0, 0, 1), 0, 9, &hit) && hit.triangle == 1, "%u of equals",
+          (unsigned)hit.triangle);
+    CHECK(hit_all(&scene, vec(0, -0.5, 9), vec(0, 0, -1), 0, 7.5, &hit) && hit.triangle == 0, "%u of equals",
+          (unsigned)hit.triangle);
     metro_scene_free(&scene);
     for (i = 0; i < 16; i++) /* a grid, seen straight on at its vertices: up to six triangles meet there */
         for (j = 0; j < 16; j++)
@@ -433,7 +434,8 @@ static void ties_go_to_the_lowest(void)
             }
             lowest = t;
             CHECK(hit_all(&scene, vec(i, j, 0), vec(0, 0, 1), 0, 9, &hit), "the vertex (%d, %d) is missed", i, j);
-            CHECK(hit.triangle == lowest && hit.t == 1, "vertex (%d, %d): triangle %u, not %u", i, j, (unsigned)hit.triangle, (unsigned)lowest);
+            CHECK(hit.triangle == lowest && hit.t == 1, "vertex (%d, %d): triangle %u, not %u", i, j,
+                  (unsigned)hit.triangle, (unsigned)lowest);
         }
     metro_scene_free(&scene);
 }
@@ -468,7 +470,8 @@ static void any_scale(void)
                 double far_off = pow(10, l);
                 metro_vec3 from = metro_add(o, metro_scale(d, -far_off * size[s]));
                 CHECK(hit_all(&scene, from, d, 0, INFINITY, &hit), "missed from %g sizes away", far_off);
-                CHECK(hit.t < (far_off + 4) * size[s] && hit.t > (far_off - 4) * size[s], "t = %g from %g sizes away", hit.t / size[s], far_off);
+                CHECK(hit.t < (far_off + 4) * size[s] && hit.t > (far_off - 4) * size[s], "t = %g from %g sizes away",
+                      hit.t / size[s], far_off);
             }
         }
         metro_scene_free(&scene);
@@ -485,18 +488,19 @@ static void bad_neighbours(void)
     int i, tiny_hits = 0;
     for (i = 0; i < 300; i++) {
         metro_vec3 p = in_box(&rng, 1), q = in_box(&rng, 1);
-        add(&scene, p, p, p);                                              /* a point */
-        add(&scene, p, q, p);                                              /* a line, twice covered */
-        add(&scene, p, metro_scale(metro_add(p, q), 0.5), q);              /* three points in a line */
+        add(&scene, p, p, p);                                 /* a point */
+        add(&scene, p, q, p);                                 /* a line, twice covered */
+        add(&scene, p, metro_scale(metro_add(p, q), 0.5), q); /* three points in a line */
         add(&scene, vec(NAN, 0, 0), p, q);
         add(&scene, p, vec(0, INFINITY, 0), q);
         add(&scene, p, q, vec(0, 0, -INFINITY));
         add(&scene, metro_scale(p, 1e-8), metro_scale(q, 1e-8), vec(1e-8, 0, 0));
     }
-    add(&scene, vec(-1e8, -1e8, 5), vec(1e8, -1e8, 5), vec(0, 1e8, 5));    /* huge, behind all others */
+    add(&scene, vec(-1e8, -1e8, 5), vec(1e8, -1e8, 5), vec(0, 1e8, 5)); /* huge, behind all others */
     good = (uint32_t)scene.triangle_count;
     cube(&scene, 5, 2, 0);
-    for (i = 0; i < 200; i++) add(&scene, vec(-1, -1, 1.5), vec(1, -1, 1.5), vec(0, 1, 1.5)); /* duplicates, coplanar */
+    for (i = 0; i < 200; i++)
+        add(&scene, vec(-1, -1, 1.5), vec(1, -1, 1.5), vec(0, 1, 1.5)); /* duplicates, coplanar */
     build(&scene);
     for (i = 0; i < 2000; i++) {
         metro_vec3 o = in_box(&rng, 1.99), d = in_box(&rng, 1);
@@ -505,17 +509,23 @@ static void bad_neighbours(void)
             break;
         }
         CHECK(hit.triangle >= good, "hits the bad triangle %u", (unsigned)hit.triangle);
-        CHECK(hit.t > 0 && hit.u > -1e-6 && hit.v > -1e-6 && hit.u + hit.v < 1.000001, "t %g, u %g, v %g", hit.t, hit.u, hit.v);
+        CHECK(hit.t > 0 && hit.u > -1e-6 && hit.v > -1e-6 && hit.u + hit.v < 1.000001, "t %g, u %g, v %g", hit.t,
+              hit.u, hit.v);
     }
-    CHECK(hit_all(&scene, vec(0, 0, 0), vec(0, 0, 1), 0.1, INFINITY, &hit) && hit.triangle == good + 300, "of equals triangle %u", (unsigned)hit.triangle);
-    CHECK(hit_all(&scene, vec(0, 0, 3), vec(0, 0, 1), 0, INFINITY, &hit) && hit.triangle == good - 1, "the huge triangle is missed");
-    CHECK(hit_all(&scene, vec(5e7, -9e7, 3), vec(0, 0, 1), 0, INFINITY, &hit) && hit.triangle == good - 1, "the huge triangle is missed far out");
+    CHECK(hit_all(&scene, vec(0, 0, 0), vec(0, 0, 1), 0.1, INFINITY, &hit) && hit.triangle == good + 300,
+          "of equals triangle %u", (unsigned)hit.triangle);
+    CHECK(hit_all(&scene, vec(0, 0, 3), vec(0, 0, 1), 0, INFINITY, &hit) && hit.triangle == good - 1,
+          "the huge triangle is missed");
+    CHECK(hit_all(&scene, vec(5e7, -9e7, 3), vec(0, 0, 1), 0, INFINITY, &hit) && hit.triangle == good - 1,
+          "the huge triangle is missed far out");
     metro_scene_free(&scene);
-    for (i = 0; i < 50; i++) add(&scene, metro_scale(in_box(&rng, 1), 1e-8), metro_scale(in_box(&rng, 1), 1e-8), vec(0, 0, 1e-8));
+    for (i = 0; i < 50; i++)
+        add(&scene, metro_scale(in_box(&rng, 1), 1e-8), metro_scale(in_box(&rng, 1), 1e-8), vec(0, 0, 1e-8));
     build(&scene);
     for (i = 0; i < 1000; i++) {
         metro_vec3 to = metro_scale(in_box(&rng, 0.3), 1e-8);
-        tiny_hits += hit_all(&scene, vec(0.3e-8, 2e-8, -3e-8), metro_subtract(to, vec(0.3e-8, 2e-8, -3e-8)), 0, INFINITY, &hit);
+        tiny_hits += hit_all(&scene, vec(0.3e-8, 2e-8, -3e-8), metro_subtract(to, vec(0.3e-8, 2e-8, -3e-8)), 0,
+                             INFINITY, &hit);
     }
     CHECK(tiny_hits > 900, "of triangles 1e-8 large only %d of 1000 are hit", tiny_hits);
     metro_scene_free(&scene);
@@ -530,7 +540,8 @@ static void deep_trees(void)
     uint64_t i, n = check_count(100000, 3000);
     for (i = 0; i < n; i++) add(&scene, vec(0, 0, 1), vec(1, 0, 1), vec(0, 1, 1)); /* all the same */
     build(&scene);
-    CHECK(hit_all(&scene, vec(0.2, 0.2, 0), vec(0, 0, 1), 0, 9, &hit) && hit.triangle == 0, "the first of equals is %u", (unsigned)hit.triangle);
+    CHECK(hit_all(&scene, vec(0.2, 0.2, 0), vec(0, 0, 1), 0, 9, &hit) && hit.triangle == 0,
+          "the first of equals is %u", (unsigned)hit.triangle);
     metro_scene_free(&scene);
     for (i = 0; i < 2000; i++) { /* each half as large as the one before, down to nothing, and again */
         double s = pow(0.5, (double)(i % 140));
@@ -571,7 +582,8 @@ static void zero_components(void)
                         d[axis] = sign;
                         d[(axis + 1) % 3] = zero[k & 1];
                         d[(axis + 2) % 3] = zero[k / 2];
-                        CHECK(hit_all(&scene, vec(o[0], o[1], o[2]), vec(d[0], d[1], d[2]), 0, INFINITY, &hit) && hit.t == 1,
+                        CHECK(hit_all(&scene, vec(o[0], o[1], o[2]), vec(d[0], d[1], d[2]), 0, INFINITY, &hit) &&
+                                  hit.t == 1,
                               "axis %d, (%d, %d): t = %g", axis, i, j, hit.t);
                     }
     metro_scene_free(&scene);
@@ -581,9 +593,12 @@ static void zero_components(void)
     add_quad(&scene, vec(9, -1, -9), vec(9, 1, -9), vec(9, 1, 9), vec(9, -1, 9));
     build(&scene);
     for (i = -8; i < 8; i++) {
-        CHECK(hit_all(&scene, vec(-20, 0, i), vec(1, 0, 0), 0, INFINITY, &hit), "the wall behind a floor edge-on is missed");
-        CHECK(hit_all(&scene, vec(-20, 0, i + 0.3), vec(1, -0.0, 0.01), 0, INFINITY, &hit), "the wall behind a floor edge-on is missed");
-        CHECK(hit_all(&scene, vec(0.5, 0, i), vec(1, 0, 0), 0, INFINITY, &hit), "the wall is missed from within the floor");
+        CHECK(hit_all(&scene, vec(-20, 0, i), vec(1, 0, 0), 0, INFINITY, &hit),
+              "the wall behind a floor edge-on is missed");
+        CHECK(hit_all(&scene, vec(-20, 0, i + 0.3), vec(1, -0.0, 0.01), 0, INFINITY, &hit),
+              "the wall behind a floor edge-on is missed");
+        CHECK(hit_all(&scene, vec(0.5, 0, i), vec(1, 0, 0), 0, INFINITY, &hit),
+              "the wall is missed from within the floor");
     }
     metro_scene_free(&scene);
 }
@@ -602,14 +617,16 @@ static void leaving_hits_not_oneself(void)
             uint32_t t;
             for (t = 0; t < 60; t++) {
                 double width = t % 3 == 0 ? 0.02 : t % 7 == 0 ? 0.001 : 1; /* needles too */
-                metro_vec3 a = in_box(&rng, size[s]), e = in_box(&rng, size[s]), f = metro_scale(in_box(&rng, size[s]), width);
+                metro_vec3 a = in_box(&rng, size[s]), e = in_box(&rng, size[s]),
+                           f = metro_scale(in_box(&rng, size[s]), width);
                 if (t % 4 == 1) a.y = e.y = f.y = 0; /* a floor */
                 a = metro_add(a, middle);
                 add(&scene, a, metro_add(a, e), metro_add(a, metro_add(metro_scale(e, 0.5), f)));
             }
             build(&scene);
             for (i = 0; i < n; i++) {
-                double u = sqrt(metro_rng_uniform(&rng)), v = metro_rng_uniform(&rng), b1 = u * (1 - v), b2 = u * v, up, needle;
+                double u = sqrt(metro_rng_uniform(&rng)), v = metro_rng_uniform(&rng), b1 = u * (1 - v), b2 = u * v,
+                       up, needle;
                 metro_vec3 a, b, c, p, d = metro_normalize(in_box(&rng, 1)), o, normal;
                 metro_hit hit;
                 t = (uint32_t)(60 * metro_rng_uniform(&rng));
@@ -627,10 +644,13 @@ static void leaving_hits_not_oneself(void)
                 if (hit_all(&scene, o, d, 0, INFINITY, &hit) && hit.triangle == t) self++;
                 needle = metro_length(metro_subtract(b, a)) * metro_length(metro_subtract(b, a));
                 needle /= metro_length(metro_cross(metro_subtract(b, a), metro_subtract(c, a)));
-                CHECK(metro_length(metro_subtract(o, p)) < 1e-5 * (size[s] * (1 + 0.2 * needle) + 0.3 * metro_length(p)),
-                      "moved by %g in a scene of size %g at %g", metro_length(metro_subtract(o, p)), size[s], away[w]);
+                CHECK(metro_length(metro_subtract(o, p)) <
+                          1e-5 * (size[s] * (1 + 0.2 * needle) + 0.3 * metro_length(p)),
+                      "moved by %g in a scene of size %g at %g", metro_length(metro_subtract(o, p)), size[s],
+                      away[w]);
             }
-            CHECK(self == 0 && above == n, "size %g at %g: %g of %g hit themselves, %g start above", size[s], away[w], (double)self, (double)n, (double)above);
+            CHECK(self == 0 && above == n, "size %g at %g: %g of %g hit themselves, %g start above", size[s], away[w],
+                  (double)self, (double)n, (double)above);
             metro_scene_free(&scene);
         }
 }
@@ -651,9 +671,11 @@ static void leaving_keeps_what_is_near(void)
         add_quad(&scene, vec(-r, h, -r), vec(-r, h, r), vec(r, h, r), vec(r, h, -r));
         build(&scene);
         for (i = 0; i < 1000; i++) {
-            metro_vec3 p = vec(uniform(&rng, -0.9 * r, 0.9 * r), 0, uniform(&rng, -0.9 * r, 0.9 * r)), d = vec(0.2, 1, 0.1);
+            metro_vec3 p = vec(uniform(&rng, -0.9 * r, 0.9 * r), 0, uniform(&rng, -0.9 * r, 0.9 * r)),
+                       d = vec(0.2, 1, 0.1);
             uint32_t t = p.x < p.z ? 0 : 1;
-            CHECK(metro_scene_occluded(&scene, metroi_scene_leave(&scene, t, p, d), d, 0, INFINITY), "no contact shadow at size %g", r);
+            CHECK(metro_scene_occluded(&scene, metroi_scene_leave(&scene, t, p, d), d, 0, INFINITY),
+                  "no contact shadow at size %g", r);
         }
         metro_scene_free(&scene);
         cube(&scene, 3, r, 0);
@@ -661,15 +683,18 @@ static void leaving_keeps_what_is_near(void)
         for (i = 0; i < n; i++) { /* from points as close to an edge of the cube as doubles can tell, or in between */
             uint32_t t = (uint32_t)(metro_rng_uniform(&rng) * (double)scene.triangle_count);
             metro_vec3 a = corner(&scene, t, 0), b = corner(&scene, t, 1), c = corner(&scene, t, 2), p, d, n0;
-            double near_by = pow(10, -uniform(&rng, 0, 16)), f = metro_rng_uniform(&rng), side = i % 3 == 0 ? f : 1 - near_by;
-            p = metro_add(metro_scale(a, near_by), metro_scale(metro_add(metro_scale(b, side), metro_scale(c, 1 - side)), 1 - near_by));
+            double near_by = pow(10, -uniform(&rng, 0, 16)), f = metro_rng_uniform(&rng),
+                   side = i % 3 == 0 ? f : 1 - near_by;
+            p = metro_add(metro_scale(a, near_by),
+                          metro_scale(metro_add(metro_scale(b, side), metro_scale(c, 1 - side)), 1 - near_by));
             n0 = metro_normalize(metro_cross(metro_subtract(b, a), metro_subtract(c, a)));
             if (metro_dot(n0, p) > 0) n0 = metro_scale(n0, -1); /* inwards */
             d = metro_normalize(in_box(&rng, 1));
             if (metro_dot(d, n0) < 0) d = metro_scale(d, -1);
             escaped += !hit_all(&scene, metroi_scene_leave(&scene, t, p, d), d, 0, INFINITY, &hit);
         }
-        CHECK(escaped == 0, "%g of %g rays from near the edges leave a cube of size %g", (double)escaped, (double)n, r);
+        CHECK(escaped == 0, "%g of %g rays from near the edges leave a cube of size %g", (double)escaped, (double)n,
+              r);
         metro_scene_free(&scene);
     }
 }
@@ -687,7 +712,8 @@ static void every_allocation_may_fail(void)
         if (metro_scene_build(&scene) == METRO_OK) break;
         allocations_left = -1;
         CHECK(allocations_live == live && scene.bvh == NULL, "allocation %ld leaves something behind", k);
-        CHECK(!metro_scene_hit(&scene, vec(0, 0, -5), vec(0, 0, 1), 0, INFINITY, &hit), "hit after a build that failed");
+        CHECK(!metro_scene_hit(&scene, vec(0, 0, -5), vec(0, 0, 1), 0, INFINITY, &hit),
+              "hit after a build that failed");
     }
     needed = k;
     allocations_left = -1;
@@ -705,13 +731,17 @@ static void memory_is_bounded(void)
     double bytes;
     cube(&scene, 60, 1, 0.03);
     build(&scene);
-    bytes = (double)(tree(&scene)->node_count * sizeof(metroi_node) + tree(&scene)->block_count * sizeof(metroi_block));
-    CHECK(40 + bytes / (double)scene.triangle_count < 105, "a mesh takes %g bytes a triangle", 40 + bytes / (double)scene.triangle_count);
+    bytes =
+        (double)(tree(&scene)->node_count * sizeof(metroi_node) + tree(&scene)->block_count * sizeof(metroi_block));
+    CHECK(40 + bytes / (double)scene.triangle_count < 105, "a mesh takes %g bytes a triangle",
+          40 + bytes / (double)scene.triangle_count);
     metro_scene_free(&scene);
     soup(&scene, &rng, 20000, 0.1);
     build(&scene);
-    bytes = (double)(tree(&scene)->node_count * sizeof(metroi_node) + tree(&scene)->block_count * sizeof(metroi_block));
-    CHECK(40 + bytes / (double)scene.triangle_count < 150, "a soup takes %g bytes a triangle", 40 + bytes / (double)scene.triangle_count);
+    bytes =
+        (double)(tree(&scene)->node_count * sizeof(metroi_node) + tree(&scene)->block_count * sizeof(metroi_block));
+    CHECK(40 + bytes / (double)scene.triangle_count < 150, "a soup takes %g bytes a triangle",
+          40 + bytes / (double)scene.triangle_count);
     metro_scene_free(&scene);
 }
 
