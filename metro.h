@@ -9163,9 +9163,10 @@ static void *metroi_grown(void *block, size_t *room, size_t need, size_t item)
 static metro_result metroi_scene_grow(metro_scene *scene, size_t more)
 {
     const size_t most = 0xffffffffu; /* numbers of triangles have 32 bits, and the last one is left free */
-    size_t need = scene->triangle_count + more, room;
+    size_t need, room;
     void *grown;
-    if (more > most || need > most) return METRO_ERROR_MEMORY;
+    if (scene->triangle_count > most || more > most - scene->triangle_count) return METRO_ERROR_MEMORY;
+    need = scene->triangle_count + more;
     if (need <= scene->triangle_room) return METRO_OK;
     room = scene->triangle_room;
     grown = metroi_grown(scene->corner, &room, need, 9 * sizeof *scene->corner);

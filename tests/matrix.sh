@@ -158,9 +158,6 @@ emulated() {
 }
 emulated "aarch64" aarch64-linux-gnu-gcc "" qemu-aarch64
 emulated "s390x, big endian" s390x-linux-gnu-gcc "" qemu-s390x
-# test_geometry crashes on i686 under the emulator, for a reason not yet found.
-tests=$(for t in $tests; do [ "$t" = test_geometry ] || echo "$t"; done)
-skip "test_geometry on i686 (crashes, to be found)"
 emulated "i686" i686-linux-gnu-gcc "-msse2 -mfpmath=sse" qemu-i386
 
 # ---- Fuzzers
