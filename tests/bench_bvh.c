@@ -156,7 +156,7 @@ static void make_rays(const metro_scene *scene, bench_ray *primary, bench_ray *d
         metro_hit hit;
         ray_set(&primary[i], metro_vec3_make(0.05, 0.05, 0.9), d, 1e30);
         if (!metro_scene_hit(scene, primary[i].origin, primary[i].direction, 0, INFINITY, &hit)) abort();
-        n = metroi_triangle_normal(scene, hit.triangle);
+        n = metroi_facet_of(scene, hit.triangle).normal;
         if (metro_dot(n, d) > 0) n = metro_scale(n, -1);
         p = metro_add(primary[i].origin, metro_scale(primary[i].direction, hit.t));
         p = metro_add(p, metro_scale(n, 1e-4));

@@ -351,6 +351,12 @@ static metro_scene lamps_scene(void)
     return scene;
 }
 
+static metro_vec3 point_of(const metro_scene *scene, uint32_t lamp, double u, double v)
+{
+    metroi_facet facet = metroi_facet_of(scene, lamp);
+    return metroi_light_point(&facet, u, v);
+}
+
 /* The frequencies of lamps are as area times luminance, the number that chose is uniform again afterwards, and points
    are uniform on each triangle, also given the lamp. Catches: areas alone, radiances alone, a running sum shifted by
    one lamp, a number that is used twice, a root that is missing. */
@@ -376,7 +382,7 @@ static void lamp_choice(void)
         metro_vec3 q[3], x, a, b, d;
         int cell;
         CHECK(u >= 0 && u < 1, "what is left is %.17g", u);
-        x = metroi_triangle_point(&scene, lamp, u, v);
+        x = point_of(&scene, lamp, u, v);
         q[0] = metro_scene_corner(&scene, lamp, 0);
         q[1] = metro_scene_corner(&scene, lamp, 1);
         q[2] = metro_scene_corner(&scene, lamp, 2);
@@ -426,7 +432,7 @@ static void lamp_extremes(void)
             CHECK(left >= 0 && left < 1, "of %.17g is left %.17g", u, left);
             CHECK(metro_scene_area(&scene, lamp) > 0, "lamp %d has no area", (int)lamp);
             for (j = 0; j < 4; j++) {
-                metro_vec3 x = metroi_triangle_point(&scene, lamp, j & 1 ? BELOW_ONE : 0, j & 2 ? BELOW_ONE : 0);
+                metro_vec3 x = point_of(&scene, lamp, j & 1 ? BELOW_ONE : 0, j & 2 ? BELOW_ONE : 0);
                 CHECK(isfinite(metro_dot(x, x)), "the point of %d is not finite", (int)j);
             }
         }
