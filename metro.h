@@ -1387,6 +1387,18 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
 /* Gives back all memory; a zeroed render is allowed. */
 METRO_API void metro_render_free(metro_render *render);
 
+/* # R13 Metropolis light
+
+   Chapter 13 has no functions of its own: METRO_MLT and METRO_PSSMLT are methods of a render, and what they alone can
+   tell stands in its report.
+
+       options.method = METRO_PSSMLT;
+       metro_render_make(&scene, &scene.camera, &options, &render);
+       metro_render_run(&render, 64, NULL, NULL);
+       metro_render_diagnose(&render, &report);
+       if (report.warning[0] != 0) puts(report.warning);
+*/
+
 #endif /* METRO_NO_TRACER */
 
 #ifdef __cplusplus
@@ -14190,6 +14202,15 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
    | x_i, alpha_i | the seeds and their probabilities | `seed`, `alpha` |
    | sigma | the standard deviation of f/p | `metro_moments_variance` is its square |
    | R(k), rho_k | the correlation at lag k | `metro_autocorrelation` |
+   | L, L_e | radiance, and what a lamp emits | `metro_material.ke`, `metroi_vertex.weight` times what follows |
+   | omega | a direction, per steradian | `direction`, `in`, `out` |
+   | f_r, k_d, k_s, n | the BRDF and its numbers, eq 11.1 | `metro_brdf`; `kd`, `ks`, `ns` of `metro_material` |
+   | theta | the angle between a direction and the normal | its cosine: `cosine`, `cos_y`, `cos_z` |
+   | y_0 .. y_{s-1} | the vertices of the shooting walk, from the lamp | `metroi_walks.y` |
+   | z_0 .. z_{t-1} | the vertices of the gathering walk, from the eye | `metroi_walks.z` |
+   | alpha | what a walk carries, eq 12.2 | `metroi_vertex.weight` |
+   | w_s | the weight of a way to make a path, eq 12.3 | `metroi_heuristic` |
+   | A_n, B_n | what a vertex knows of the other ways, eq 12.6 | `metroi_vertex.a`, `.b` |
 
    # C License
 

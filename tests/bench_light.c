@@ -116,8 +116,8 @@ int main(int argc, char **argv)
     for (i = 0; i < sizeof scenes / sizeof *scenes; i++) {
         stage s;
         stage_load(&s, scenes[i]);
-        printf("%s, %g CPU seconds, %d seeds      relMSE  efficiency  samples/s     rays/s  worst mean off\n", scenes[i],
-               seconds, seeds);
+        printf("%s, %g CPU seconds, %d seeds      relMSE  efficiency  samples/s     rays/s  worst mean off\n",
+               scenes[i], seconds, seeds);
         for (j = 0; j < sizeof contenders / sizeof *contenders; j++) {
             double sum[5] = { 0, 0, 0, 0, 0 };
             for (seed = 1; seed <= seeds; seed++) run_once(&s, &contenders[j], seconds, (uint64_t)seed, sum);

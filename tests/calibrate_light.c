@@ -26,8 +26,8 @@ typedef struct {
     double mean, blocks, runs, bias, squares;
 } coverage;
 
-static void run_once(const metro_scene *scene, const metro_image *reference, double truth, metro_render_options options,
-                     uint64_t rounds, coverage *sum)
+static void run_once(const metro_scene *scene, const metro_image *reference, double truth,
+                     metro_render_options options, uint64_t rounds, coverage *sum)
 {
     metro_render render;
     metro_render_report report;
@@ -59,7 +59,8 @@ static void scene_runs(const char *name, int runs, uint64_t rounds, metro_render
     memset(&scene, 0, sizeof scene);
     memset(&sum, 0, sizeof sum);
     snprintf(path, sizeof path, "tests/data/%s.obj", name);
-    if (metro_scene_load_obj(&scene, path, message, sizeof message) != METRO_OK || metro_scene_build(&scene) != METRO_OK) {
+    if (metro_scene_load_obj(&scene, path, message, sizeof message) != METRO_OK ||
+        metro_scene_build(&scene) != METRO_OK) {
         printf("%s: %s\n", path, message);
         exit(1);
     }
@@ -73,8 +74,9 @@ static void scene_runs(const char *name, int runs, uint64_t rounds, metro_render
         options.seed = 1000 + (uint64_t)i;
         run_once(&scene, &reference, difference.mean, options, rounds, &sum);
     }
-    printf("%-3s %-28s %4.0f runs of %3d rounds: mean luminance held %5.1f %%, blocks %5.1f %%; mean off by %+.2f +- %.2f "
-           "of its error\n", name, what, sum.runs, (int)rounds, 100 * sum.mean / sum.runs, 100 * sum.blocks / sum.runs,
+    printf("%-3s %-28s %4.0f runs of %3d rounds: mean luminance held %5.1f %%, blocks %5.1f %%; "
+           "mean off by %+.2f +- %.2f of its error\n",
+           name, what, sum.runs, (int)rounds, 100 * sum.mean / sum.runs, 100 * sum.blocks / sum.runs,
            sum.bias / sum.runs, sqrt(sum.squares / sum.runs));
     fflush(stdout);
     metro_image_free(&reference);

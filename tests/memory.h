@@ -1,4 +1,5 @@
-/* memory.h: include it before metro.h, and every allocation of the library is counted and the k-th can be made to fail. */
+/* memory.h: include it before metro.h, and every allocation of the library is counted, and the k-th can be made to
+   fail. */
 
 #ifndef MEMORY_H
 #define MEMORY_H

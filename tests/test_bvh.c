@@ -1,8 +1,8 @@
 /* test_bvh: chapter 10. Independent truth is a loop over all triangles: in double (Moller and Trumbore 1997) for what
-   is hit, and with the chapter's own test of one triangle for the bits. METRO_BVH_RAYS sets the number of rays for the
-   bits and the leaks (1e6 when unset), so that `make check` can run 1e7. */
+   is hit, and with the chapter's own test of one triangle for the bits. METRO_BVH_RAYS sets the number of rays for
+   the bits and the leaks (1e6 when unset), so that `make check` can run 1e7. */
 
-/* The loop computes the chapter's own test in here, so multiplications and additions must not be contracted here either. */
+/* The loop computes the chapter's own test in here, so products and sums must not be contracted here either. */
 #if defined(__clang__)
 #pragma STDC FP_CONTRACT OFF
 #elif defined(__GNUC__)
@@ -303,7 +303,8 @@ static void leaks_of_scene(metro_scene *scene, double r, int convex, uint64_t ra
     metro_scene_free(scene);
 }
 
-/* Fails when the pads are 1, when products are fused, when 0 counts as outside, and when a component of 0 loses a box. */
+/* Fails when the pads are 1, when products are fused, when 0 counts as outside, and when a component of 0 loses a
+   box. */
 static void closed_scenes_do_not_leak(void)
 {
     double rays = rays_asked();
