@@ -68,6 +68,7 @@
        R10 BVH
        R11 Light
        R12 Paths
+       R13 Metropolis light
        1 Ground
        1.1 Results
        1.2 Vectors
@@ -9059,8 +9060,8 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    and no scaling is needed.
 
    These small functions are asked at every hit, so they are compiled as fast as the rest of the program, and what is
-   METROI_INLINE is inlined wherever it is used: their vectors then stay in registers, which makes the walks of chapter
-   12 a tenth faster. */
+   METROI_INLINE is inlined wherever it is used: vectors then stay in registers, which makes the walks of chapter 12 a
+   tenth faster. */
 
 #ifdef METROI_COMPILE_FAST
 #pragma GCC pop_options

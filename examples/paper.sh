@@ -2,7 +2,7 @@
 # make paper: runs every example that draws a figure, chart or table, one after the other, and says how long it took.
 # Each program uses all cores. The data (CSV), charts (SVG) and pictures (PNG, PFM) go to out/. QUICK=1 makes them small.
 set -u
-programs="hello fig1 fig2 seeds size startup operator picture own failures accuracy
+programs="hello fig1 fig2 seeds errata size startup operator picture own failures accuracy
  fig3 fig4 fig5 pyramid colours bias decay costs"
 total=$(echo $programs | wc -w)
 start=$(date +%s)
