@@ -1,6 +1,6 @@
 /* failures.c: where methods fail, seen. Four sheets, and the sections of the paper they belong to:
 
-   - out/failures.svg (section 1.1): three mistakes in a Metropolis step, each of a line or less. The target is flat,
+   - out/failures.svg (section 1.1): four mistakes in a Metropolis step, each of a line or less. The target is flat,
      so any density but 1 is wrong; the check of detailed balance finds each mistake without knowing the answer.
    - out/failures_islands.svg: two islands farther apart than a step. Chains agree as long as all sit on one island.
    - out/failures_acceptance.svg (section 2.3): the mean squared error against the acceptance rate, for all sizes of
@@ -12,7 +12,7 @@
 #include "../metro.h"
 #include "plot.h"
 
-enum { STEPS = 5, GROUPS = 20, BINS = 40 };                            /* of the first sheet, */
+enum { STEPS = 6, GROUPS = 20, BINS = 40 };                            /* of the first sheet, */
 enum { VOYAGES = 3, CHAINS = 4, DRAWS = 20000, SHOWN = 500 };          /* the second, */
 enum { TARGETS = 3, SIZES = 40, CELLS = 128, RUN = 1000 };             /* the third, */
 enum { CUTS = 3, POINTS = 20, GRIDS = 5, FIRST_GRID = 64, AFTER = 4 }; /* and the last */
@@ -90,6 +90,13 @@ static double uneven(const double *from, double *to, metro_rng *rng, void *user)
     return right > 0 ? 0.3 / 0.7 : 0.7 / 0.3;
 }
 
+/* The listing of the paper has T(i -> t) above and below, which cancels. */
+static double cancelled(const double *from, double *to, metro_rng *rng, void *user)
+{
+    uneven(from, to, rng, user);
+    return 1;
+}
+
 static double upside_down(const double *from, double *to, metro_rng *rng, void *user)
 {
     return 1 / uneven(from, to, rng, user);
@@ -104,6 +111,7 @@ static const struct {
                        { "uneven", "right, uneven steps", uneven, 0, 0x888888 },
                        { "clamped", "border clamped", clamped, 1, 0xd55e00 },
                        { "dropped", "rejection dropped", dropped, 1, 0x0072b2 },
+                       { "cancelled", "T cancelled", cancelled, 1, 0xcc79a7 },
                        { "upside_down", "T upside down", upside_down, 1, 0x009e73 } };
 
 /* Adds the histogram of a chain from a random point to `density`, and its part in the outer bins to `outer`. */
