@@ -15,6 +15,13 @@ diff -r out/book build/book2 > /dev/null || { echo "weaving twice gives two book
 $weave metro.h out out/book --extract build/docs > /dev/null
 awk '/^```c$/ { on = 1; next } /^```$/ { if (on) exit } on' README.md | cmp -s - examples/hello.c ||
     { echo "README does not show examples/hello.c as it is" >&2; exit 1; }
+if [ -f out/claims.csv ]; then # every claim that examples/claims.c knows has its line in the book, in the same words
+    tail -n +2 out/claims.csv | while IFS=, read -r key section statement rest; do
+        line="| $section | $statement | [value: claims.csv, key=$key, measurement, %s] | \
+[value: claims.csv, key=$key, verdict, %s] |"
+        grep -qxF "$line" docs/claims.md || { echo "docs/claims.md lacks the line $line" >&2; exit 1; }
+    done
+fi
 count=0
 for program in build/docs/*.c; do
     [ -f "$program" ] || continue

@@ -1,9 +1,10 @@
 #!/bin/sh
 # make paper: runs every example that draws a figure, chart or table, one after the other, and says how long it took.
+# The last one compares what they have measured with what the paper says, and its table is printed.
 # Each program uses all cores. The data (CSV), charts (SVG) and pictures (PNG, PFM) go to out/. QUICK=1 makes them small.
 set -u
 programs="hello fig1 fig2 seeds errata size startup operator picture own failures accuracy
- fig3 fig4 fig5 pyramid colours bias decay failures_light costs"
+ fig3 fig4 fig5 pyramid colours bias decay failures_light costs claims"
 total=$(echo $programs | wc -w)
 start=$(date +%s)
 done=0
@@ -27,4 +28,7 @@ for program in $programs; do
 done
 bar "$total" "$total" "done"
 if [ -t 2 ]; then echo >&2; fi
+echo
+cat out/claims.txt
+echo
 echo "all figures and charts are in out/, after $(($(date +%s) - start)) s"
