@@ -559,7 +559,7 @@ static void joins_right(const table *const *t, finding *f)
     decide(f, s.worst, 1, 0);
     f->is = !(s.count > 0) ? NOT_MEASURED : s.worst > 6 ? REFUTED : farthest < 0.1 ? REPRODUCED : UNDECIDED;
     snprintf(f->words, sizeof f->words,
-             "%.0f ways of joining, each alone: off by %.1f %% at most; the worst score of 8 parts is %.1f", s.count,
+             "%.0f ways of joining; each alone: off by %.1f %% at most; the worst score of 8 parts is %.1f", s.count,
              100 * farthest, s.worst);
 }
 
