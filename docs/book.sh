@@ -18,7 +18,7 @@ awk '/^```c$/ { on = 1; next } /^```$/ { if (on) exit } on' README.md | cmp -s -
 if [ -f out/claims.csv ]; then # every claim that examples/claims.c knows has its line in the book, in the same words
     tail -n +2 out/claims.csv | while IFS=, read -r key section statement rest; do
         line="| $section | $statement | [value: claims.csv, key=$key, measurement, %s] | \
-[value: claims.csv, key=$key, verdict, %s] |"
+**[value: claims.csv, key=$key, verdict, %s]** |"
         grep -qxF "$line" docs/claims.md || { echo "docs/claims.md lacks the line $line" >&2; exit 1; }
     done
 fi
