@@ -15515,26 +15515,49 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
    scramble of its own, so that the batches are independent and their spread states the error.
 
    It is tempting to save coordinates and to take the next direction from the next point of a sequence in two
-   dimensions. But neighbours of such a sequence avoid each other: the second direction of a walk is never near the
-   first, however many walks are made, and the products of eq 14.6 are integrated over a part of the space only. The
-   picture converges, and it is wrong.
+   dimensions. Such a sequence mirrors the digits of the number of the point, in base 2 for one coordinate and in base
+   3 for the other (Halton 1960):
+
+       h_b(n_1 + n_2 b + n_3 b^2 + ...) = frac{n_1}{b} + frac{n_2}{b^2} + frac{n_3}{b^3} + ...               (14.8)
+
+   But then every other point has the first coordinate of the one before it, plus 1/2: neighbours avoid each other. The
+   second direction of a walk is never near the first, however many walks are made, and the products of eq 14.6 are
+   integrated over a part of the space only. The picture converges, and it is wrong. A random shift of the whole
+   sequence, modulo 1, makes the batches independent and does not help.
 
    [figure: runon.svg | A sequence that runs on converges to a wrong answer: error against walks.] */
+
+static double metroi_halton(uint64_t n, unsigned base)
+{
+    double x = 0, digit = 1;
+    for (; n > 0; n /= base) {
+        digit /= base;
+        x += digit * (double)(n % base); /* eq 14.8 */
+    }
+    return x;
+}
+
+/* Coordinate 0 or 1 of direction k in walk `round` of a batch. */
+
+static double metroi_walk_coordinate(const metroi_bundles *plan, uint64_t round, size_t k, unsigned c,
+                                     uint64_t scramble, metro_rng *rng)
+{
+    unsigned dimension = 2 * (unsigned)k + c;
+    double x = metro_rng_uniform(rng);
+    if (plan->options->walk != METRO_WALK_EVEN) return x;
+    if (!plan->options->run_on) return dimension < 32 ? metro_sobol(round, dimension, scramble) : x;
+    x = metroi_halton(round * plan->directions + k, c == 0 ? 2 : 3) + metro_sobol(0, c, scramble);
+    return x < 1 ? x : x - 1;
+}
 
 static void metroi_walk_choose(metroi_batch *batch, uint64_t round, uint64_t scramble, metro_rng *rng)
 {
     const metroi_bundles *plan = batch->plan;
-    const metro_bundles_options *options = plan->options;
     size_t d = plan->directions, k;
     for (k = 0; k < d; k++) {
-        metro_vec3 direction = metro_rng_direction(rng);
-        unsigned dimension = options->run_on ? 0 : 2 * (unsigned)k;
-        if (options->walk == METRO_WALK_EVEN && dimension < 32) {
-            uint64_t point = options->run_on ? round * d + k : round;
-            direction = metroi_direction_at(metro_vec3_make(0, 0, 1), 1 - 2 * metro_sobol(point, dimension, scramble),
-                                            metro_sobol(point, dimension + 1, scramble));
-        }
-        metroi_direction_put(direction, batch->state + 3 * k);
+        double height = 1 - 2 * metroi_walk_coordinate(plan, round, k, 0, scramble, rng);
+        double turn = metroi_walk_coordinate(plan, round, k, 1, scramble, rng);
+        metroi_direction_put(metroi_direction_at(metro_vec3_make(0, 0, 1), height, turn), batch->state + 3 * k);
     }
     for (k = 3 * d; k < 5 * d; k++) batch->state[k] = metro_rng_uniform(rng);
 }
@@ -15559,7 +15582,7 @@ static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
    numbers the shadow rays. The importance is the luminance that the walk adds to the picture: with $v_i$ the share of
    the picture that shows patch i, and $Y_i$ the luminance of what it sends to the eye,
 
-       I = sum_{i} v_i Y_i                                                            (14.8)
+       I = sum_{i} v_i Y_i                                                            (14.9)
 
    A mutation perturbs all directions inside a cone, or one of them; the grids move by up to as much as the rim of the
    scene does. What a state adds to the sums is its contribution over I, and the sums are scaled by b (eq 4.1).
@@ -15582,7 +15605,7 @@ static double metroi_walk_importance(const double *z, void *sample, void *user)
     shots = metro_rng_make(plan->key, number);
     metroi_bundles_walk(batch, z, &shots, out);
     for (i = 0; i < count; i++)
-        importance += plan->share[i] * metro_luminance(out[3 * i], out[3 * i + 1], out[3 * i + 2]); /* eq 14.8 */
+        importance += plan->share[i] * metro_luminance(out[3 * i], out[3 * i + 1], out[3 * i + 2]); /* eq 14.9 */
     out[3 * count] = importance;
     return importance;
 }

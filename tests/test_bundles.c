@@ -526,6 +526,480 @@ static void sphere(void)
     metro_scene_free(&scene);
 }
 
+/* ---- methods against each other ---- */
+
+/* A room with a lamp in its ceiling and two boxes, all diffuse, or with a glossy floor and box. */
+static metro_scene room_scene(double gloss)
+{
+    metro_scene scene = empty_scene();
+    uint32_t side[6], wall[6], i;
+    uint32_t white = add_material(&scene, metro_vec3_make(0.7, 0.6, 0.5), grey(0), 0, grey(0));
+    uint32_t shiny = add_material(&scene, grey(0.6 - gloss), grey(gloss), 6, grey(0));
+    uint32_t lamp = add_material(&scene, grey(0), grey(0), 0, metro_vec3_make(9, 8, 7));
+    for (i = 0; i < 6; i++) wall[i] = white;
+    for (i = 0; i < 6; i++) side[i] = shiny;
+    wall[2] = shiny;
+    add_box(&scene, grey(-1), grey(1), 1, wall);
+    add_box(&scene, metro_vec3_make(-0.7, -0.9, -0.6), metro_vec3_make(-0.2, 0.1, -0.1), 0, side);
+    add_box(&scene, metro_vec3_make(0.1, -0.95, -0.5), metro_vec3_make(0.6, -0.5, 0), 0, side);
+    add_quad(&scene, metro_vec3_make(-0.4, 0.95, -0.4), metro_vec3_make(0.8, 0, 0), metro_vec3_make(0, 0, 0.8), lamp);
+    build(&scene);
+    return scene;
+}
+
+/* In the limit of small patches a picture by bundles is that of paths. The patches are a tenth of the room: what they
+   leave of the discretisation is allowed for by 2 per cent. Planted: emission sent in the last step too, or twice the
+   glossy lobe. */
+static void bidirectional_paths(void)
+{
+    int g, shot;
+    for (g = 0; g < 2; g++) {
+        metro_scene scene = room_scene(g ? 0.5 : 0);
+        metro_camera camera = inside_camera();
+        metro_render_options paths = options_make(METRO_BDPT, 32, 4);
+        metro_render render = render_run(&scene, &camera, &paths, check_count(24, 8));
+        metro_image picture = render_image(&render);
+        metro_render_report seen;
+        metro_render_diagnose(&render, &seen);
+        for (shot = 0; shot < 2; shot++) {
+            metro_bundles_options options = bundles_options(4, 0.2, shot ? 60 : 100);
+            metro_bundles bundles;
+            metro_bundles_report report;
+            metro_image image;
+            metro_image_difference difference;
+            double error, lamp;
+            options.first_shot = shot;
+            options.visibility = METRO_LINES;
+            bundles = bundles_run(&scene, &camera, &options, check_count(shot ? 192 : 384, 64));
+            report = report_of(&bundles);
+            memset(&image, 0, sizeof image);
+            CHECK(metro_bundles_image(&bundles, &image) == METRO_OK, "image");
+            metro_image_error(&image, &picture, &difference);
+            error = sqrt(report.mean_error * report.mean_error + seen.mean_error * seen.mean_error);
+            CHECK(fabs(difference.mean - seen.mean) < 0.02 * seen.mean + 5.1 * error, "%g, paths %g +- %g",
+                  difference.mean, seen.mean, error);
+            lamp = difference.mean - report.mean; /* seen directly */
+            CHECK(lamp > 0.02, "the lamp adds %g", lamp);
+            if (shot) CHECK(difference.relative_rmse < 0.25, "the picture is off by %g", difference.relative_rmse);
+            metro_image_free(&image);
+            metro_bundles_free(&bundles);
+        }
+        metro_image_free(&picture);
+        metro_render_free(&render);
+        metro_scene_free(&scene);
+    }
+}
+
+/* Every walk has the same answer: random, even, by chains from all three starts, with one direction perturbed, with
+   large steps, after a first shot. Planted: without Veach's weight the third is off. */
+static void walks_agree(void)
+{
+    metro_scene scene = room_scene(0.3);
+    metro_camera camera = inside_camera();
+    metro_bundles_options options = bundles_options(4, 0.7, 40);
+    metro_bundles reference, other;
+    metro_bundles_report report;
+    uint64_t walks = check_count(3200, 640);
+    options.visibility = METRO_LINES;
+    options.batches = 32;
+    reference = bundles_run(&scene, &camera, &options, 2 * walks);
+    CHECK(isnan(report_of(&reference).b), "random walks have no b");
+    options.seed = 1;
+    options.visibility = METRO_SWEEP;
+    other = bundles_run(&scene, &camera, &options, walks);
+    agree("sweep", &reference, &other);
+    metro_bundles_free(&other);
+    options.visibility = METRO_LINES;
+    options.walk = METRO_WALK_EVEN;
+    other = bundles_run(&scene, &camera, &options, walks);
+    agree("even", &reference, &other);
+    metro_bundles_free(&other);
+    options.first_shot = 1;
+    other = bundles_run(&scene, &camera, &options, walks / 4);
+    agree("first shot", &reference, &other);
+    CHECK(report_of(&other).mean_error < report_of(&reference).mean_error, "a first shot has the error %g, not %g",
+          report_of(&other).mean_error, report_of(&reference).mean_error);
+    metro_bundles_free(&other);
+    options.first_shot = 0;
+    options.walk = METRO_WALK_METROPOLIS;
+    options.perturbation = 2;
+    other = bundles_run(&scene, &camera, &options, walks);
+    agree("metropolis", &reference, &other);
+    report = report_of(&other);
+    CHECK_SIGMA(report.b, report_of(&reference).mean, hypot(report.b_error, report_of(&reference).mean_error));
+    CHECK(report.acceptance > 0.1 && report.acceptance < 0.9, "acceptance %g", report.acceptance);
+    CHECK(report.squared_jump > 0 && report.dark >= 0 && report.longest_stay > 0, "the counts of the chains");
+    metro_bundles_free(&other);
+    options.one_direction = 1;
+    options.large_step = 0.2;
+    options.start = METRO_START_POINT;
+    other = bundles_run(&scene, &camera, &options, walks);
+    agree("one direction, large steps, from a point", &reference, &other);
+    metro_bundles_free(&other);
+    options.first_shot = 1;
+    options.start = METRO_START_SEEDS;
+    other = bundles_run(&scene, &camera, &options, walks / 2);
+    agree("metropolis after a first shot", &reference, &other);
+    metro_bundles_free(&other);
+    metro_bundles_free(&reference);
+    metro_scene_free(&scene);
+}
+
+/* Veach's weights leave no bias, however short the chains: 2048 chains of two steps, from one candidate each. Their
+   plain counterpart, chosen from two candidates and scaled by b, is not asked. */
+static void weighted_start(void)
+{
+    metro_scene scene = room_scene(0.3);
+    metro_camera camera = inside_camera();
+    metro_bundles_options options = bundles_options(3, 1, 20);
+    metro_bundles reference, weighted;
+    options.visibility = METRO_LINES;
+    options.batches = 64;
+    options.width = options.height = 8;
+    reference = bundles_run(&scene, &camera, &options, check_count(12800, 3200));
+    options.walk = METRO_WALK_METROPOLIS;
+    options.start = METRO_START_WEIGHTED;
+    options.candidates = 2;
+    options.perturbation = 0.4;
+    options.batches = (size_t)check_count(1600, 600);
+    weighted = bundles_run(&scene, &camera, &options, 2 * options.batches);
+    agree("weighted", &reference, &weighted);
+    metro_bundles_free(&weighted);
+    metro_bundles_free(&reference);
+    metro_scene_free(&scene);
+}
+
+/* Trap 44: a sequence that runs on gets more certain of a wrong answer. */
+static void run_on(void)
+{
+    metro_scene scene = room_scene(0);
+    metro_camera camera = inside_camera();
+    metro_bundles_options options = bundles_options(6, 0.7, 40);
+    metro_bundles right, wrong;
+    metro_bundles_report a, b;
+    options.visibility = METRO_LINES;
+    options.batches = 32;
+    right = bundles_run(&scene, &camera, &options, check_count(4000, 1000));
+    options.walk = METRO_WALK_EVEN;
+    options.run_on = 1;
+    wrong = bundles_run(&scene, &camera, &options, check_count(4000, 1000));
+    a = report_of(&right);
+    b = report_of(&wrong);
+    CHECK(fabs(a.mean - b.mean) > 6 * hypot(a.mean_error, b.mean_error), "%g +- %g, and running on %g +- %g", a.mean,
+          a.mean_error, b.mean, b.mean_error);
+    metro_bundles_free(&right);
+    metro_bundles_free(&wrong);
+    metro_scene_free(&scene);
+}
+
+/* Trap 47: a lamp of a twentieth of a cell. Of the open scene's light only what the floor reflects counts: a small
+   lamp above a floor, one reflection. A first shot sees it in each walk. */
+static void narrow_lamp(void)
+{
+    metro_scene scene = empty_scene();
+    uint32_t floor_ = add_material(&scene, grey(0.8), grey(0), 0, grey(0));
+    uint32_t lamp = add_material(&scene, grey(0), grey(0), 0, grey(1000));
+    metro_camera camera = camera_make(metro_vec3_make(0, 3, 0.01), metro_vec3_make(0, 0, 0), 36);
+    metro_bundles_options options = bundles_options(2, 0.5, 6);
+    metro_bundles exact, lines, grid;
+    camera.up = metro_vec3_make(0, 0, -1);
+    add_quad(&scene, metro_vec3_make(-1, 0, -1), metro_vec3_make(0, 0, 2), metro_vec3_make(2, 0, 0), floor_);
+    add_quad(&scene, metro_vec3_make(0.3, 1, 0.3), metro_vec3_make(0.03, 0, 0), metro_vec3_make(0, 0, 0.03), lamp);
+    build(&scene);
+    options.first_shot = 1;
+    exact = bundles_run(&scene, &camera, &options, check_count(3200, 800));
+    CHECK(exact.bundles == 0 && exact.rays > 0, "one reflection after a first shot takes no bundle");
+    options.first_shot = 0;
+    options.batches = 64;
+    options.visibility = METRO_LINES;
+    lines = bundles_run(&scene, &camera, &options, check_count(200000, 50000));
+    agree("lines", &exact, &lines);
+    options.visibility = METRO_SWEEP;
+    grid = bundles_run(&scene, &camera, &options, check_count(1600000, 800000));
+    agree("grid", &exact, &grid);
+    CHECK(report_of(&grid).mean_error > 0, "no lamp was met");
+    metro_bundles_free(&exact);
+    metro_bundles_free(&lines);
+    metro_bundles_free(&grid);
+    metro_scene_free(&scene);
+}
+
+/* ---- what a program needs ---- */
+
+static metro_vec3 *radiance_of(const metro_bundles *bundles, metro_vec3 *error)
+{
+    metro_vec3 *radiance = colors_make(&bundles->patches, 0);
+    metro_result result = metro_bundles_radiance(bundles, radiance, error);
+    CHECK(result == METRO_OK, "radiance: %s", metro_result_text(result));
+    return radiance;
+}
+
+/* One, two and three threads, in one call or in several, give the same bits. */
+static void threads(void)
+{
+    metro_scene scene = room_scene(0.3);
+    metro_camera camera = inside_camera();
+    int walk, shot, t;
+    for (walk = 0; walk < 3; walk++)
+        for (shot = 0; shot < 2; shot++) {
+            metro_vec3 *first = NULL;
+            metro_image image[3];
+            size_t size = 0;
+            for (t = 0; t < 3; t++) {
+                metro_bundles_options options = bundles_options(4, 0.7, 30);
+                metro_bundles bundles;
+                metro_vec3 *radiance;
+                options.walk = (metro_walk)walk;
+                options.first_shot = shot;
+                options.threads = (size_t)t + 1;
+                bundles = bundles_run(&scene, &camera, &options, t == 1 ? 17 : 64);
+                if (t == 1) metro_bundles_run(&bundles, 32, NULL, NULL);
+                CHECK(bundles.walks == 64, "%g walks", (double)bundles.walks);
+                radiance = radiance_of(&bundles, NULL);
+                size = bundles.patches.count * sizeof *radiance;
+                memset(&image[t], 0, sizeof image[t]);
+                CHECK(metro_bundles_image(&bundles, &image[t]) == METRO_OK, "image");
+                if (t == 0) first = radiance;
+                else {
+                    CHECK(memcmp(first, radiance, size) == 0, "walk %d: %d threads give other bits", walk, t + 1);
+                    CHECK(image_same(&image[0], &image[t]), "walk %d: %d threads give another picture", walk, t + 1);
+                    free(radiance);
+                }
+                metro_bundles_free(&bundles);
+            }
+            for (t = 0; t < 3; t++) metro_image_free(&image[t]);
+            free(first);
+        }
+    metro_scene_free(&scene);
+}
+
+/* Shares of a run are independent, and seeds and parts matter. */
+static void parts(void)
+{
+    metro_scene scene = room_scene(0);
+    metro_camera camera = inside_camera();
+    metro_bundles_options options = bundles_options(3, 0.7, 20);
+    double mean[3];
+    int k;
+    for (k = 0; k < 3; k++) {
+        metro_bundles bundles;
+        options.seed = k == 1;
+        options.part = k == 2;
+        bundles = bundles_run(&scene, &camera, &options, 32);
+        mean[k] = report_of(&bundles).mean;
+        metro_bundles_free(&bundles);
+    }
+    CHECK(mean[0] != mean[1] && mean[0] != mean[2] && mean[1] != mean[2], "%g %g %g", mean[0], mean[1], mean[2]);
+    metro_scene_free(&scene);
+}
+
+static int stop_at_once(const metro_bundles *bundles, void *user)
+{
+    *(uint64_t *)user = bundles->walks;
+    return 1;
+}
+
+static void arguments(void)
+{
+    metro_scene scene = room_scene(0), empty = empty_scene(), unbuilt = empty_scene();
+    metro_camera camera = inside_camera(), bad = camera;
+    metro_patches patches, untouched;
+    metro_bundles bundles;
+    metro_bundles_options options;
+    metro_bundles_report report;
+    metro_vec3 *colors, axis = metro_vec3_make(0, 0, 1);
+    metro_image image;
+    double shift[2] = { 0, 0 };
+    uint64_t walks = 0;
+    int k;
+    memset(&patches, 7, sizeof patches);
+    untouched = patches;
+    CHECK(metro_patches_make(NULL, 1, &patches) == METRO_ERROR_ARGUMENT, "no scene");
+    CHECK(metro_patches_make(&scene, 1, NULL) == METRO_ERROR_ARGUMENT, "no patches");
+    CHECK(metro_patches_make(&scene, 0, &patches) == METRO_ERROR_ARGUMENT, "size 0");
+    CHECK(metro_patches_make(&scene, -1, &patches) == METRO_ERROR_ARGUMENT, "size -1");
+    CHECK(metro_patches_make(&scene, (double)NAN, &patches) == METRO_ERROR_ARGUMENT, "size NaN");
+    CHECK(metro_patches_make(&scene, 1e-9, &patches) == METRO_ERROR_MEMORY, "too many");
+    CHECK(memcmp(&patches, &untouched, sizeof patches) == 0, "patches are touched");
+    CHECK(metro_patches_make(&empty, 1, &patches) == METRO_OK && patches.count == 0, "an empty scene");
+    CHECK(metro_bundle_transfer(&patches, axis, 8, NULL, METRO_SWEEP, &axis, &axis, NULL) == METRO_OK, "nothing");
+    metro_patches_free(&patches);
+    patches = patches_make(&scene, 1);
+    colors = colors_make(&patches, 3);
+#define REFUSED(...) CHECK(metro_bundle_transfer(__VA_ARGS__) == METRO_ERROR_ARGUMENT, #__VA_ARGS__)
+    REFUSED(NULL, axis, 8, shift, METRO_SWEEP, colors, colors, NULL);
+    REFUSED(&patches, grey(0), 8, shift, METRO_SWEEP, colors, colors, NULL);
+    REFUSED(&patches, grey((double)NAN), 8, shift, METRO_SWEEP, colors, colors, NULL);
+    REFUSED(&patches, axis, 0, shift, METRO_SWEEP, colors, colors, NULL);
+    REFUSED(&patches, axis, 16385, shift, METRO_SWEEP, colors, colors, NULL);
+    REFUSED(&patches, axis, 8, shift, (metro_visibility)4, colors, colors, NULL);
+    REFUSED(&patches, axis, 8, shift, METRO_SWEEP, NULL, colors, NULL);
+    REFUSED(&patches, axis, 8, shift, METRO_SWEEP, colors, NULL, NULL);
+    shift[1] = 1;
+    REFUSED(&patches, axis, 8, shift, METRO_SWEEP, colors, colors, NULL);
+    shift[1] = (double)NAN;
+    REFUSED(&patches, axis, 8, shift, METRO_SWEEP, colors, colors, NULL);
+#undef REFUSED
+    CHECK(colors[0].x == 3, "the radiance is touched");
+    free(colors);
+    metro_patches_free(&patches);
+
+    memset(&bundles, 0, sizeof bundles);
+    CHECK(metro_bundles_make(NULL, &camera, NULL, &bundles) == METRO_ERROR_ARGUMENT, "no scene");
+    CHECK(metro_bundles_make(&scene, NULL, NULL, &bundles) == METRO_ERROR_ARGUMENT, "no camera");
+    CHECK(metro_bundles_make(&unbuilt, &camera, NULL, &bundles) == METRO_ERROR_ARGUMENT, "not built");
+    bad.fov = 0;
+    CHECK(metro_bundles_make(&scene, &bad, NULL, &bundles) == METRO_ERROR_ARGUMENT, "no camera");
+    for (k = 0; k < 14; k++) {
+        options = bundles_options(4, 1, 8);
+        if (k == 0) options.depth = 1;
+        if (k == 1) options.depth = METRO_DEPTH_MOST + 1;
+        if (k == 2) options.patch = -1;
+        if (k == 3) options.patch = (double)NAN;
+        if (k == 4) options.grid = 16385;
+        if (k == 5) options.visibility = (metro_visibility)4;
+        if (k == 6) options.walk = (metro_walk)3;
+        if (k == 7) options.start = (metro_start)3;
+        if (k == 8) options.batches = 1;
+        if (k == 9) options.batches = 4097;
+        if (k == 10) options.large_step = 1.5;
+        if (k == 11) options.perturbation = -1;
+        if (k == 12) options.width = SIZE_MAX / 2;
+        if (k == 13) options.perturbation = HUGE_VAL;
+        CHECK(metro_bundles_make(&scene, &camera, &options, &bundles) == METRO_ERROR_ARGUMENT, "option %d", k);
+    }
+    add_quad(&unbuilt, grey(0), metro_vec3_make(1, 0, 0), metro_vec3_make(0, 1, 0), 0);
+    build(&unbuilt);
+    CHECK(metro_bundles_make(&unbuilt, &camera, NULL, &bundles) == METRO_ERROR_NO_LIGHT, "no lamp");
+    CHECK(bundles.state == NULL && bundles.share == NULL, "bundles are touched");
+    CHECK(metro_bundles_run(&bundles, 1, NULL, NULL) == METRO_ERROR_ARGUMENT, "run what was not made");
+    CHECK(metro_bundles_image(&bundles, &image) == METRO_ERROR_ARGUMENT, "no image");
+    metro_bundles_diagnose(&bundles, &report);
+    CHECK_NAN(report.mean);
+    options = bundles_options(METRO_DEPTH_MOST, 1, 8);
+    options.walk = METRO_WALK_EVEN; /* more directions than the sequence has coordinates for */
+    CHECK(metro_bundles_make(&scene, &camera, &options, &bundles) == METRO_OK, "the most depth");
+    CHECK(metro_bundles_image(&bundles, &image) == METRO_ERROR_ARGUMENT, "no walk yet");
+    CHECK(metro_bundles_run(&bundles, 0, NULL, NULL) == METRO_OK && bundles.walks == 0, "no walks");
+    CHECK(metro_bundles_run(&bundles, 1000, stop_at_once, &walks) == METRO_ERROR_STOPPED, "stopped");
+    CHECK(walks == 16 && bundles.walks == 16, "stopped after %g walks", (double)walks);
+    metro_bundles_diagnose(&bundles, &report);
+    CHECK(report.mean > 0, "mean %g", report.mean);
+    metro_bundles_free(&bundles);
+    metro_bundles_free(&bundles);
+    metro_scene_free(&scene);
+    metro_scene_free(&unbuilt);
+}
+
+/* A lamp that shines away from everything: chains have nowhere to start, walks are dark. */
+static void dark(void)
+{
+    metro_scene scene = empty_scene();
+    uint32_t lamp = add_material(&scene, grey(0), grey(0), 0, grey(1));
+    metro_camera camera = camera_make(metro_vec3_make(0, 1, 3), metro_vec3_make(0, 0, 0), 40);
+    metro_bundles_options options = bundles_options(3, 1, 8);
+    metro_bundles bundles;
+    int start;
+    add_quad(&scene, grey(0), metro_vec3_make(0, 0, 1), metro_vec3_make(1, 0, 0), 0);
+    add_quad(&scene, metro_vec3_make(0, 1, 0), metro_vec3_make(0, 0, 1), metro_vec3_make(1, 0, 0), lamp);
+    build(&scene);
+    bundles = bundles_run(&scene, &camera, &options, 16);
+    CHECK(report_of(&bundles).mean == 0, "mean %g", report_of(&bundles).mean);
+    metro_bundles_free(&bundles);
+    options.walk = METRO_WALK_METROPOLIS;
+    for (start = 0; start < 3; start++) {
+        options.start = (metro_start)start;
+        CHECK(metro_bundles_make(&scene, &camera, &options, &bundles) == METRO_OK, "make");
+        CHECK(metro_bundles_run(&bundles, 16, NULL, NULL) == METRO_ERROR_NO_IMPORTANCE, "start %d", start);
+        CHECK(metro_bundles_run(&bundles, 16, NULL, NULL) == METRO_ERROR_NO_IMPORTANCE, "and again");
+        CHECK(bundles.walks == 0 && isnan(report_of(&bundles).mean), "nothing is there");
+        metro_bundles_free(&bundles);
+    }
+    metro_scene_free(&scene);
+}
+
+/* Every allocation fails once: the result says so, nothing is touched and nothing is kept. */
+static void failing_memory(void)
+{
+    metro_scene scene = room_scene(0.2);
+    metro_camera camera = inside_camera();
+    metro_patches patches, plain;
+    metro_vec3 *colors;
+    metro_result result = METRO_ERROR_MEMORY;
+    long live = allocations_live, k;
+    int v, walk;
+    memset(&patches, 7, sizeof patches);
+    plain = patches;
+    for (k = 0; result != METRO_OK && k < 100; k++) {
+        allocations_left = k;
+        result = metro_patches_make(&scene, 0.9, &patches);
+        allocations_left = -1;
+        CHECK(result == METRO_OK || result == METRO_ERROR_MEMORY, "%s", metro_result_text(result));
+        if (result == METRO_OK) break;
+        CHECK(allocations_live == live && memcmp(&patches, &plain, sizeof patches) == 0, "allocation %ld", k);
+    }
+    CHECK(k == 3, "%ld allocations", k);
+    live = allocations_live;
+    colors = colors_make(&patches, 5);
+    for (v = 0; v < 4; v++) {
+        result = METRO_ERROR_MEMORY;
+        for (k = 0; result != METRO_OK && k < 100; k++) {
+            allocations_left = k;
+            result = metro_bundle_transfer(&patches, grey(1), 8, NULL, (metro_visibility)v, colors, colors, NULL);
+            allocations_left = -1;
+            if (result == METRO_OK) continue;
+            CHECK(allocations_live == live && colors[0].x == 5, "allocation %ld", k);
+        }
+        CHECK(k > 3 && allocations_live == live, "%ld allocations", k);
+        colors[0].x = 5;
+    }
+    free(colors);
+    metro_patches_free(&patches);
+    live = allocations_live;
+    for (walk = 0; walk < 3; walk++) {
+        metro_bundles_options options = bundles_options(3, 0.9, 8);
+        metro_bundles bundles, untouched;
+        metro_image image;
+        options.walk = (metro_walk)walk;
+        options.first_shot = 1;
+        options.batches = 3;
+        memset(&bundles, 7, sizeof bundles);
+        untouched = bundles;
+        result = METRO_ERROR_MEMORY;
+        for (k = 0; result != METRO_OK && k < 1000; k++) {
+            allocations_left = k;
+            result = metro_bundles_make(&scene, &camera, &options, &bundles);
+            allocations_left = -1;
+            if (result == METRO_OK) continue;
+            CHECK(result == METRO_ERROR_MEMORY, "%s", metro_result_text(result));
+            CHECK(allocations_live == live && memcmp(&bundles, &untouched, sizeof bundles) == 0, "allocation %ld", k);
+        }
+        CHECK(k > 20, "%ld allocations", k);
+        result = METRO_ERROR_MEMORY;
+        for (k = 0; result != METRO_OK && k < 100; k++) {
+            allocations_left = k;
+            result = metro_bundles_run(&bundles, 3, NULL, NULL);
+            allocations_left = -1;
+            CHECK(bundles.walks == (result == METRO_OK ? 3u : 0u), "%g walks", (double)bundles.walks);
+        }
+        CHECK(k > 1, "%ld allocations", k);
+        memset(&image, 7, sizeof image);
+        result = METRO_ERROR_MEMORY;
+        for (k = 0; result != METRO_OK && k < 100; k++) {
+            long before = allocations_live;
+            allocations_left = k;
+            result = metro_bundles_image(&bundles, &image);
+            allocations_left = -1;
+            if (result != METRO_OK) CHECK(allocations_live == before, "allocation %ld", k);
+        }
+        CHECK(k > 2, "%ld allocations", k);
+        metro_image_free(&image);
+        metro_bundles_free(&bundles);
+        CHECK(allocations_live == live, "%ld allocations are left", allocations_live - live);
+    }
+    metro_scene_free(&scene);
+}
+
 int main(void)
 {
     CHECK_RUN(patches_cover);
@@ -538,5 +1012,15 @@ int main(void)
     CHECK_RUN(touching_patches);
     CHECK_RUN(furnace);
     CHECK_RUN(sphere);
+    CHECK_RUN(bidirectional_paths);
+    CHECK_RUN(walks_agree);
+    CHECK_RUN(weighted_start);
+    CHECK_RUN(run_on);
+    CHECK_RUN(narrow_lamp);
+    CHECK_RUN(threads);
+    CHECK_RUN(parts);
+    CHECK_RUN(arguments);
+    CHECK_RUN(dark);
+    CHECK_RUN(failing_memory);
     return check_done("bundles");
 }
