@@ -6,9 +6,9 @@
    stands in the OBJ file, in a line `# camera eye 0 1 4 look 0 1 0 up 0 1 0 fov 40`, or comes from --eye and --look;
    without either the whole scene is framed.
 
-   A run is counted in rounds; a round is on average one sample a pixel. The same options and rounds give the same
-   picture, bit for bit, on any number of threads. So a run of --seconds, or one that Ctrl-C ended, says which
-   --rounds repeats it.
+   A run is counted in rounds; a round is on average one sample a pixel. Ray bundles are counted in walks. The same
+   options and rounds give the same picture, bit for bit, on any number of threads. So a run of --seconds, or one that
+   Ctrl-C ended, says which --rounds or --walks repeats it.
 
    A picture too large for one machine is made in shares: `render room.obj --part 0/4 --out share0.pfm`, the same with
    1/4, 2/4 and 3/4 elsewhere, and `merge room.pfm share?.pfm`.
@@ -25,13 +25,13 @@
 #include "../metro.h"
 #include "plot.h"
 
-enum { OUTS = 8, PIECE = 64, DEFAULT_ROUNDS = 64 };
+enum { OUTS = 8, PIECE = 64, DEFAULT_ROUNDS = 64, DEFAULT_WALKS = 512 };
 
 /* ---- The options ---- */
 
 enum {
-    METHOD, EYE, LOOK, UP, FOV, SIZE, DEPTH, SPP, ROUNDS, SECONDS, PERTURBATION, LARGE, CHAINS, START, SEED, THREADS,
-    PART, REFERENCE, OUT, CSV, OPTIONS
+    METHOD, EYE, LOOK, UP, FOV, SIZE, DEPTH, SPP, ROUNDS, SECONDS, PERTURBATION, LARGE, CHAINS, START, WALKS, GRID,
+    PATCH, SEED, THREADS, PART, REFERENCE, OUT, CSV, OPTIONS
 };
 enum { WORD, WHOLE, WHOLE_PAIR, REAL, VECTOR, TEXT };
 
@@ -43,13 +43,18 @@ typedef struct {
     const char *value, *help;
 } option;
 
-static const char *const method_name[] = { "bdpt", "path", "light", "mlt", "pssmlt", NULL }; /* as metro_method */
-static const char *const start_name[] = { "seeds", "point", "weighted", NULL };              /* as metro_start */
+/* As metro_method, and then the ways of chapter 14, as metro_walk. */
+enum { BUNDLE = METRO_PSSMLT + 1, BUNDLE_QMC, BUNDLE_MLT };
+static const char *const method_name[] = { "bdpt",   "path",       "light",      "mlt", "pssmlt",
+                                           "bundle", "bundle-qmc", "bundle-mlt", NULL };
+static const char *const start_name[] = { "seeds", "point", "weighted", NULL }; /* as metro_start */
 
 static const option options[OPTIONS] = {
-    { "--method", WORD, 0, 0, "path, light, bdpt, mlt or pssmlt", "bdpt", "NAME",
+    { "--method", WORD, 0, 0, "path, light, bdpt, mlt, pssmlt, bundle, bundle-qmc or bundle-mlt", "bdpt", "NAME",
       "path: from the eye; light: from the lamps; bdpt: from both (default); mlt:\n"
-      "Metropolis sampling of directions, the paper's; pssmlt: of random numbers" },
+      "Metropolis sampling of directions, the paper's; pssmlt: of random numbers;\n"
+      "bundle, bundle-qmc, bundle-mlt: ray bundles along random, evenly spread or\n"
+      "Metropolis directions, which show the surfaces as patches" },
     { "--eye", VECTOR, -1e30, 1e30, "three numbers x,y,z without blanks", "0,1,4", "x,y,z", "where the camera is" },
     { "--look", VECTOR, -1e30, 1e30, "three numbers x,y,z without blanks", "0,1,0", "x,y,z", "what it looks at" },
     { "--up", VECTOR, -1e30, 1e30, "three numbers x,y,z without blanks", "0,1,0", "x,y,z",
@@ -64,15 +69,23 @@ static const option options[OPTIONS] = {
     { "--rounds", WHOLE, 1, 1e9, "a whole number from 1 to 1000000000", "64", "N", "default 64" },
     { "--seconds", REAL, 1e-3, 1e9, "seconds from .001 to 1e9", "10", "S",
       "ends with the round in which this time has passed since loading" },
-    { "--perturbation", REAL, 1e-6, 6.2831853071795865, "a size above 0, for mlt in radians up to 6.28", "0.3", "X",
-      "mlt: the apex angle of the cone in radians, default .3;\n"
-      "pssmlt: the largest step, as a part of 1, default .03" },
+    { "--perturbation", REAL, 1e-6, 6.2831853071795865,
+      "a size above 0, for mlt and bundle-mlt in radians up to 6.28", "0.3", "X",
+      "mlt, bundle-mlt: the apex angle of the cone in radians, default .3 and .6;\n"
+      "pssmlt: the largest step, as a part of 1, default .02" },
     { "--large", REAL, 0, 1, "a probability from 0 to 1", "0.4", "P",
-      "probability of a large step; default 0 for mlt, .4 for pssmlt" },
-    { "--chains", WHOLE, 1, 4096, "a whole number from 1 to 4096", "64", "N", "of mlt and pssmlt; default 64" },
+      "probability of a large step; default .3 for pssmlt, else 0" },
+    { "--chains", WHOLE, 1, 4096, "a whole number from 1 to 4096", "64", "N",
+      "of mlt and pssmlt, default 64, or bundle-mlt, default 16" },
     { "--start", WORD, 0, 0, "point, seeds or weighted", "seeds", "NAME",
-      "of mlt and pssmlt; point: the same in each run; seeds: a draw by\n"
+      "of the Metropolis methods; point: the same in each run; seeds: a draw by\n"
       "importance (default); weighted: one with Veach's weight" },
+    { "--walks", WHOLE, 1, 1e9, "a whole number from 1 to 1000000000", "1024", "N",
+      "of ray bundles, each of depth - 1 directions; default 512" },
+    { "--grid", WHOLE, 1, 16384, "a whole number from 1 to 16384", "256", "N",
+      "rows of parallel rays in a bundle; default: some for each patch" },
+    { "--patch", REAL, 1e-30, 1e30, "a length above 0", "0.1", "SIZE",
+      "the longest edge of a patch; default: a tenth of the scene's radius" },
     { "--seed", WHOLE, 0, 18446744073709551615.0, "a whole number below 2^64", "1", "N",
       "another seed, other noise; default 0" },
     { "--threads", WHOLE, 1, 1024, "a whole number from 1 to 1024", "2", "N", "default: one a core" },
@@ -226,15 +239,27 @@ static int read_option(request *r, const char *name, const char *value)
 static int check_request(const request *r)
 {
     const answer *a = r->answers;
-    int uses_chains = a[METHOD].whole[0] == METRO_MLT || a[METHOD].whole[0] == METRO_PSSMLT, id, pfm = 0, i;
+    uint64_t method = a[METHOD].whole[0];
+    int uses_chains = method == METRO_MLT || method == METRO_PSSMLT || method == BUNDLE_MLT, id, pfm = 0, i;
     if (r->scene == NULL)
         return refuse("no scene", "", "render SCENE.obj makes a picture of it; render --help says more");
-    if (a[SPP].given + a[ROUNDS].given + a[SECONDS].given > 1)
-        return refuse("--spp, --rounds, --seconds", "", "give one of them, not more");
+    if (a[SPP].given + a[ROUNDS].given + a[SECONDS].given + a[WALKS].given > 1)
+        return refuse("--spp, --rounds, --walks, --seconds", "", "give one of them, not more");
+    if (method >= BUNDLE && a[SPP].given + a[ROUNDS].given > 0)
+        return refuse(a[SPP].given ? "--spp" : "--rounds", "",
+                      "ray bundles are counted in walks, as in --walks 1024");
+    if (method >= BUNDLE && a[DEPTH].whole[0] == 1)
+        return refuse("--depth", "1", "ray bundles need an edge between surfaces, so 2 or more");
     for (id = PERTURBATION; id <= START; id++)
         if (a[id].given && !uses_chains)
             return refuse(options[id].name, a[id].text,
-                          "only --method mlt and pssmlt have it; leave it out or choose one");
+                          "only --method mlt, pssmlt and bundle-mlt have it; leave it out or choose one");
+    for (id = WALKS; id <= PATCH; id++)
+        if (a[id].given && method < BUNDLE)
+            return refuse(options[id].name, a[id].text,
+                          "only --method bundle, bundle-qmc and bundle-mlt have it; leave it out or choose one");
+    if (method == BUNDLE_MLT && a[CHAINS].given && a[CHAINS].whole[0] < 2)
+        return refuse("--chains", a[CHAINS].text, "for bundle-mlt two at least, whose spread gives the error");
     if (a[PERTURBATION].real[0] > 1 && a[METHOD].whole[0] == METRO_PSSMLT)
         return refuse("--perturbation", a[PERTURBATION].text,
                       "for pssmlt it is a part of 1, as in --perturbation 0.03");
@@ -292,6 +317,14 @@ static int read_request(int argc, char **argv, request *r)
 
 /* ---- What is read before the run ---- */
 
+/* What a run came to, whatever the method. */
+typedef struct {
+    uint64_t rounds, samples, rays; /* of bundles: walks for both */
+    double perturbation, large_step;
+    size_t width, height, threads, chains;
+    int depth;
+} outcome;
+
 typedef struct {
     request asked;
     metro_scene scene;
@@ -299,12 +332,14 @@ typedef struct {
     int framed; /* nobody said where the camera is */
     metro_image reference;
     double noise; /* the reference's own relMSE */
-    metro_render_options options;
+    metro_render_options options; /* of bundles: what they have in common */
     char default_out[2][300];
     metro_render render;
+    metro_bundles bundles;
+    outcome made;
     double started, seconds; /* on the wall */
     metro_image image;
-    metro_render_report report;
+    metro_render_report report; /* of bundles: what they have of it, and NaN */
     metro_image_difference difference;
 } work;
 
@@ -379,6 +414,8 @@ static int choose_camera(work *w)
     return a[EYE].given || a[LOOK].given || a[UP].given ? 2 : 1;
 }
 
+static int is_bundle(const work *w) { return w->asked.answers[METHOD].whole[0] >= BUNDLE; }
+
 static void choose_options(work *w)
 {
     const answer *a = w->asked.answers;
@@ -387,7 +424,7 @@ static void choose_options(work *w)
     o->height = a[SIZE].given ? (size_t)a[SIZE].whole[1] : w->reference.height;
     if (o->width == 0) o->width = o->height = 128;
     o->depth = (int)a[DEPTH].whole[0];
-    o->method = (metro_method)a[METHOD].whole[0];
+    o->method = is_bundle(w) ? METRO_BDPT : (metro_method)a[METHOD].whole[0];
     o->seed = a[SEED].whole[0];
     o->part = a[PART].whole[0];
     o->threads = (size_t)a[THREADS].whole[0];
@@ -494,38 +531,124 @@ static double seconds_now(void)
 static double progress(const work *w, uint64_t rounds)
 {
     const answer *a = w->asked.answers;
-    uint64_t asked = a[SPP].given ? a[SPP].whole[0] : a[ROUNDS].given ? a[ROUNDS].whole[0] : (uint64_t)DEFAULT_ROUNDS;
+    uint64_t asked = is_bundle(w) ? DEFAULT_WALKS : DEFAULT_ROUNDS;
+    int id;
     if (a[SECONDS].given) return (seconds_now() - w->started) / a[SECONDS].real[0];
+    for (id = SPP; id <= WALKS; id++)
+        if (a[id].given && (id == SPP || id == ROUNDS || id == WALKS)) asked = a[id].whole[0];
     return (double)rounds / (double)asked;
 }
 
-static int stop(const metro_render *render, void *user)
+static int ends_after(const work *w, uint64_t rounds)
 {
-    const work *w = (const work *)user;
-    double done = progress(w, render->rounds);
+    double done = progress(w, rounds);
     int ends = done >= 1 || interrupted;
     plot_progress(ends ? 1 : done, interrupted ? "" : "Ctrl-C ends after this round");
     return ends;
 }
 
+static int stop_render(const metro_render *render, void *user)
+{
+    return ends_after((const work *)user, render->rounds);
+}
+
+static int stop_bundles(const metro_bundles *bundles, void *user)
+{
+    return ends_after((const work *)user, bundles->walks);
+}
+
+static metro_result run_render(work *w, metro_result *ended)
+{
+    metro_render *r = &w->render;
+    metro_result result = metro_render_make(&w->scene, &w->camera, &w->options, r);
+    if (result != METRO_OK) return result;
+    *ended = metro_render_run(r, UINT64_MAX, stop_render, w);
+    w->seconds = seconds_now() - w->started;
+    w->made.rounds = r->rounds;
+    w->made.samples = r->samples;
+    w->made.rays = r->rays;
+    w->made.perturbation = r->options.perturbation;
+    w->made.large_step = r->options.large_step;
+    w->made.width = r->options.width;
+    w->made.height = r->options.height;
+    w->made.threads = r->options.threads;
+    w->made.chains = r->options.chains;
+    w->made.depth = r->options.depth;
+    if (r->rounds == 0) return METRO_OK;
+    metro_render_diagnose(r, &w->report);
+    return metro_render_image(r, &w->image);
+}
+
+static metro_bundles_options bundle_options(const work *w)
+{
+    const answer *a = w->asked.answers;
+    metro_bundles_options o;
+    memset(&o, 0, sizeof o);
+    o.width = w->options.width;
+    o.height = w->options.height;
+    o.depth = w->options.depth;
+    o.patch = a[PATCH].real[0];
+    o.grid = (size_t)a[GRID].whole[0];
+    o.walk = (metro_walk)(a[METHOD].whole[0] - BUNDLE);
+    o.first_shot = 1;
+    o.batches = w->options.chains;
+    o.seed = w->options.seed;
+    o.part = w->options.part;
+    o.threads = w->options.threads;
+    o.start = w->options.start;
+    o.perturbation = w->options.perturbation;
+    o.large_step = w->options.large_step > 0 ? w->options.large_step : 0;
+    return o;
+}
+
+static void report_bundles(work *w)
+{
+    metro_bundles_report p;
+    metro_render_report *r = &w->report;
+    metro_bundles_diagnose(&w->bundles, &p);
+    r->mean = p.mean;
+    r->mean_error = p.mean_error;
+    r->b = p.b;
+    r->b_error = p.b_error;
+    r->acceptance = p.acceptance;
+    r->dark = p.dark;
+    r->squared_jump = p.squared_jump;
+    r->longest_stay = p.longest_stay;
+    r->rhat = r->ess = r->worst = NAN;
+}
+
+static metro_result run_bundles(work *w, metro_result *ended)
+{
+    metro_bundles_options o = bundle_options(w);
+    metro_bundles *b = &w->bundles;
+    metro_result result = metro_bundles_make(&w->scene, &w->camera, &o, b);
+    if (result != METRO_OK) return result;
+    *ended = metro_bundles_run(b, UINT64_MAX, stop_bundles, w);
+    w->seconds = seconds_now() - w->started;
+    w->made.rounds = w->made.samples = b->walks;
+    w->made.rays = b->rays;
+    w->made.perturbation = b->options.perturbation;
+    w->made.large_step = b->options.large_step;
+    w->made.width = b->options.width;
+    w->made.height = b->options.height;
+    w->made.threads = b->options.threads;
+    w->made.chains = b->options.batches;
+    w->made.depth = b->options.depth;
+    if (b->walks == 0) return METRO_OK;
+    report_bundles(w);
+    return metro_bundles_image(b, &w->image);
+}
+
 static int run(work *w)
 {
-    metro_result result;
-    int status = 0;
+    metro_result result, ended = METRO_ERROR_STOPPED;
     signal(SIGINT, interrupt);
     w->started = seconds_now();
     plot_progress(0, w->asked.scene);
-    result = metro_render_make(&w->scene, &w->camera, &w->options, &w->render);
-    if (result != METRO_OK) return complain(w->asked.scene, metro_result_text(result));
-    result = metro_render_run(&w->render, UINT64_MAX, stop, w);
-    w->seconds = seconds_now() - w->started;
+    result = is_bundle(w) ? run_bundles(w, &ended) : run_render(w, &ended);
     plot_progress(1, "");
-    if (result != METRO_ERROR_STOPPED) status = complain(w->asked.scene, metro_result_text(result));
-    if (w->render.rounds == 0) return status;
-    result = metro_render_image(&w->render, &w->image);
     if (result != METRO_OK) return complain(w->asked.scene, metro_result_text(result));
-    metro_render_diagnose(&w->render, &w->report);
-    return status;
+    return ended == METRO_ERROR_STOPPED ? 0 : complain(w->asked.scene, metro_result_text(ended));
 }
 
 /* ---- Pictures, weight and table ---- */
@@ -536,7 +659,7 @@ static int save_weight(const work *w, const char *path)
     const uint64_t *part = w->asked.answers[PART].whole;
     char text[32];
     plot_csv csv = plot_csv_open(path, "weight,seed,part,parts");
-    snprintf(text, sizeof text, "%llu", (unsigned long long)w->render.samples);
+    snprintf(text, sizeof text, "%llu", (unsigned long long)w->made.samples);
     plot_csv_text(&csv, text);
     snprintf(text, sizeof text, "%llu", (unsigned long long)w->options.seed);
     plot_csv_text(&csv, text);
@@ -575,25 +698,25 @@ static int save_picture(const work *w, const char *path)
 /* Where the render has no such number, NaN stands in the table. */
 static void fill_row(const work *w, plot_csv *csv)
 {
-    const metro_render *r = &w->render;
+    const outcome *m = &w->made;
     const metro_render_report *p = &w->report;
     int walks = !isnan(p->acceptance), compared = w->reference.value != NULL;
     char seed[32];
     snprintf(seed, sizeof seed, "%llu", (unsigned long long)w->options.seed);
     plot_csv_text(csv, w->asked.scene);
-    plot_csv_text(csv, method_name[w->options.method]);
+    plot_csv_text(csv, method_name[w->asked.answers[METHOD].whole[0]]);
     plot_csv_text(csv, walks ? start_name[w->options.start] : "");
-    plot_csv_number(csv, (double)r->options.width);
-    plot_csv_number(csv, (double)r->options.height);
-    plot_csv_number(csv, (double)r->options.depth);
+    plot_csv_number(csv, (double)m->width);
+    plot_csv_number(csv, (double)m->height);
+    plot_csv_number(csv, (double)m->depth);
     plot_csv_text(csv, seed);
     plot_csv_number(csv, (double)w->options.part);
     plot_csv_number(csv, w->asked.answers[PART].given ? (double)w->asked.answers[PART].whole[1] : 1);
-    plot_csv_number(csv, (double)r->rounds);
-    plot_csv_number(csv, (double)r->options.threads);
+    plot_csv_number(csv, (double)m->rounds);
+    plot_csv_number(csv, (double)m->threads);
     plot_csv_number(csv, w->seconds);
-    plot_csv_number(csv, (double)r->samples);
-    plot_csv_number(csv, (double)r->rays);
+    plot_csv_number(csv, (double)m->samples);
+    plot_csv_number(csv, (double)m->rays);
     plot_csv_number(csv, p->mean);
     plot_csv_number(csv, p->mean_error);
     plot_csv_number(csv, p->b);
@@ -604,9 +727,9 @@ static void fill_row(const work *w, plot_csv *csv)
     plot_csv_number(csv, p->rhat);
     plot_csv_number(csv, p->ess);
     plot_csv_number(csv, (double)p->not_finite);
-    plot_csv_number(csv, walks ? r->options.perturbation : NAN);
-    plot_csv_number(csv, walks ? r->options.large_step : NAN);
-    plot_csv_number(csv, walks ? (double)r->options.chains : NAN);
+    plot_csv_number(csv, walks ? m->perturbation : NAN);
+    plot_csv_number(csv, walks ? m->large_step : NAN);
+    plot_csv_number(csv, walks ? (double)m->chains : NAN);
     plot_csv_number(csv, compared ? w->difference.relmse - w->noise : NAN);
     plot_csv_number(csv, compared ? w->difference.relative_rmse : NAN);
     plot_csv_number(csv, compared ? w->noise : NAN);
@@ -648,17 +771,23 @@ static void say_camera(const work *w)
 
 static void say_run(const work *w)
 {
-    const metro_render *r = &w->render;
-    double samples = (double)r->samples, rays = (double)r->rays;
+    const outcome *m = &w->made;
+    double samples = (double)m->samples, rays = (double)m->rays;
     printf("%s: %lu triangles, %lu of them lamps\n", w->asked.scene, (unsigned long)w->scene.triangle_count,
            (unsigned long)w->scene.light_count);
     say_camera(w);
-    printf("%s, %lu x %lu pixels, depth %d, seed %llu: %llu rounds in %.2f s on %lu threads\n",
-           method_name[w->options.method], (unsigned long)r->options.width, (unsigned long)r->options.height,
-           r->options.depth, (unsigned long long)w->options.seed, (unsigned long long)r->rounds, w->seconds,
-           (unsigned long)r->options.threads);
-    printf("%.4g million samples (%.3g million a second), %.4g million rays (%.3g million a second)\n",
-           1e-6 * samples, 1e-6 * samples / w->seconds, 1e-6 * rays, 1e-6 * rays / w->seconds);
+    printf("%s, %lu x %lu pixels, depth %d, seed %llu: %llu %s in %.2f s on %lu threads\n",
+           method_name[w->asked.answers[METHOD].whole[0]], (unsigned long)m->width, (unsigned long)m->height,
+           m->depth, (unsigned long long)w->options.seed, (unsigned long long)m->rounds,
+           is_bundle(w) ? "walks" : "rounds", w->seconds, (unsigned long)m->threads);
+    if (is_bundle(w))
+        printf("%lu patches, %lu x %lu lines in a bundle, %llu bundles (%.3g a second)\n",
+               (unsigned long)w->bundles.patches.count, (unsigned long)w->bundles.options.grid,
+               (unsigned long)w->bundles.options.grid, (unsigned long long)w->bundles.bundles,
+               (double)w->bundles.bundles / w->seconds);
+    else
+        printf("%.4g million samples (%.3g million a second), %.4g million rays (%.3g million a second)\n",
+               1e-6 * samples, 1e-6 * samples / w->seconds, 1e-6 * rays, 1e-6 * rays / w->seconds);
 }
 
 static void say_trust(const work *w)
@@ -668,8 +797,9 @@ static void say_trust(const work *w)
     if (!isnan(p->acceptance)) {
         printf("b %.5g +- %.2g; %.1f %% of the mutations accepted, %.1f %% dark, longest stay %llu mutations\n", p->b,
                p->b_error, 100 * p->acceptance, 100 * p->dark, (unsigned long long)p->longest_stay);
-        printf("over %lu chains: worst R-hat %.3f, smallest ESS %.0f\n", (unsigned long)w->render.options.chains,
-               p->rhat, p->ess);
+        if (!isnan(p->rhat))
+            printf("over %lu chains: worst R-hat %.3f, smallest ESS %.0f\n", (unsigned long)w->made.chains, p->rhat,
+                   p->ess);
     }
     if (w->reference.value != NULL) {
         printf("relMSE %.4g", w->difference.relmse - w->noise);
@@ -688,7 +818,8 @@ static void say_files(const work *w)
     for (i = 0; i < w->asked.outs; i++) printf("%s %s", i > 0 ? "," : "", w->asked.out[i]);
     printf("\n");
     if (w->asked.answers[SECONDS].given || interrupted)
-        printf("the same picture again: --rounds %llu\n", (unsigned long long)w->render.rounds);
+        printf("the same picture again: --%s %llu\n", is_bundle(w) ? "walks" : "rounds",
+               (unsigned long long)w->made.rounds);
 }
 
 /* Writes everything and says what it is worth. */
@@ -702,8 +833,8 @@ static int finish(work *w)
     say_trust(w);
     if (status == 0) say_files(w);
     if (interrupted)
-        fprintf(stderr, "render: interrupted; the picture of %llu rounds is %s\n",
-                (unsigned long long)w->render.rounds, status == 0 ? "written" : "not written");
+        fprintf(stderr, "render: interrupted; the picture of %llu %s is %s\n", (unsigned long long)w->made.rounds,
+                is_bundle(w) ? "walks" : "rounds", status == 0 ? "written" : "not written");
     return fflush(stdout) == 0 ? status : 1;
 }
 
@@ -728,6 +859,7 @@ int main(int argc, char **argv)
     signal(SIGINT, SIG_DFL); /* a shell lets its jobs in the background ignore it */
     status = make_picture(&w);
     metro_render_free(&w.render);
+    metro_bundles_free(&w.bundles);
     metro_image_free(&w.image);
     metro_image_free(&w.reference);
     metro_scene_free(&w.scene);

@@ -134,19 +134,28 @@ done
 refuses "too many pixels" 2 '2^31 - 1' "$render" room.obj --size 65536x65536
 refuses "a depth of 33" 2 'from 1 to 32' "$render" room.obj --depth 33
 refuses "a field of view of 180" 2 'degrees' "$render" room.obj --fov 180
-refuses "an unknown method" 2 'path, light, bdpt, mlt or pssmlt' "$render" room.obj --method bundle
+refuses "an unknown method" 2 'pssmlt, bundle, bundle-qmc or bundle-mlt' "$render" room.obj --method bundles
 refuses "an unknown start" 2 'point, seeds or weighted' "$render" room.obj --method mlt --start here
 refuses "two lengths" 2 'give one of them' "$render" room.obj --spp 3 --seconds 2
-refuses "chains of paths" 2 'only --method mlt and pssmlt' "$render" room.obj --method path --chains 4
-refuses "a large step of paths" 2 'only --method mlt and pssmlt' "$render" room.obj --large 0
+refuses "chains of paths" 2 'only --method mlt, pssmlt and bundle-mlt' "$render" room.obj --method path --chains 4
+refuses "a large step of paths" 2 'only --method mlt, pssmlt and bundle-mlt' "$render" room.obj --large 0
 refuses "a step above 1" 2 'a part of 1' "$render" room.obj --method pssmlt --perturbation 2
+refuses "walks of paths" 2 'only --method bundle, bundle-qmc' "$render" room.obj --walks 8
+refuses "a grid of paths" 2 'only --method bundle, bundle-qmc' "$render" room.obj --method mlt --grid 8
+refuses "rounds of bundles" 2 'counted in walks' "$render" room.obj --method bundle --rounds 8
+refuses "samples of bundles" 2 'counted in walks' "$render" room.obj --method bundle-mlt --spp 8
+refuses "chains of even bundles" 2 'only --method mlt, pssmlt and bundle-mlt' "$render" room.obj --method bundle-qmc \
+    --chains 8
+refuses "one chain of bundles" 2 'two at least' "$render" room.obj --method bundle-mlt --chains 1
+refuses "bundles without an edge" 2 '2 or more' "$render" room.obj --method bundle --depth 1
+refuses "a patch of nothing" 2 'a length above 0' "$render" room.obj --method bundle --patch 0
 refuses "a picture of no kind" 2 '.pfm, .ppm or .png' "$render" room.obj --out room.jpg
 refuses "a share too many" 2 '0 to n - 1' "$render" room.obj --part 4/4 --out a.pfm
 refuses "a share without a file" 2 '--out share0.pfm' "$render" room.obj --part 0/4
 refuses "a camera in what it looks at" 2 '--eye and --look' "$render" room.obj --eye 0,1,0
 refuses "a camera upright along the view" 2 '--up' "$render" room.obj --up 0,0,-3
 works "help" "$render" --help
-[ "$(grep -c '^  --' output)" -eq 20 ]
+[ "$(grep -c '^  --' output)" -eq 23 ]
 result "help lists all options" $?
 
 # Bad input: status 1, one line that names the file.
@@ -223,6 +232,32 @@ for bound in path:.05 light:.05 bdpt:.05 mlt:.3 pssmlt:.3; do
         result "$method is not $other" $?
     done
 done
+cp output paths
+for bound in bundle:.2 bundle-qmc:.2 bundle-mlt:.2; do # the lamp by 6 x 6 samples a pixel
+    method=${bound%:*}
+    small_bundles="--size 16x12 --depth 4 --method $method --patch .2 --grid 96"
+    works "$method" "$render" room.obj $small_bundles --walks 1000 --seed 1 --reference reference.pfm \
+        --out $method.pfm --csv bundles.csv
+    below "$method agrees with the reference" "${bound#*:}"
+    says "$method is what was used" "^$method, 16 x 12 pixels, depth 4, seed 1: 1008 walks"
+    works "$method on one thread" "$render" room.obj $small_bundles --walks 32 --threads 1 --out one.pfm
+    works "$method on two threads" "$render" room.obj $small_bundles --walks 32 --threads 2 --out two.pfm
+    same "$method is the same on one and two threads" one.pfm two.pfm
+    ! cmp -s $method.pfm bdpt.pfm
+    result "$method is not bdpt" $?
+done
+works "a time for bundles" "$render" room.obj $small_bundles --seconds .1 --out time.pfm
+walks=$(sed -n 's/^the same picture again: --walks //p' output)
+works "these walks" "$render" room.obj $small_bundles --walks "${walks:-1}" --out again.pfm
+same "the same picture" time.pfm again.pfm
+works "larger patches" "$render" room.obj --size 16x12 --depth 4 --method bundle --patch 1 --walks 16 --out b.pfm
+says "patches as large as asked for" '^[0-9]* patches, '
+works "half of the bundles" "$render" room.obj $small_bundles --walks 32 --part 0/2 --out share0.pfm
+works "the other half" "$render" room.obj $small_bundles --walks 32 --part 1/2 --out share1.pfm
+! cmp -s share0.pfm share1.pfm
+result "two shares, two pictures" $?
+works "the halves together" "$merge" merged.pfm share0.pfm share1.pfm
+cp paths output
 says "b and its error" '^b [0-9.]* +- [0-9.]*; [0-9.]* % of the mutations accepted, .* longest stay [0-9]* mutations$'
 says "R-hat" 'worst R-hat [0-9.]*, smallest ESS [0-9]*$'
 [ "$(wc -l < runs.csv)" -eq 6 ] && [ "$(grep -c '^scene,method' runs.csv)" -eq 1 ] &&
