@@ -715,8 +715,8 @@ static void large_avoids_bias(const table *const *t, finding *f)
              a_error, b, b_error);
 }
 
-/* ln of the efficiency 1/(relMSE x seconds) at the last look. Of the repeats the table knows the extremes. There are 6,
-   whose range is 6.2 times the standard error of their mean if they are normal, or 3 with QUICK=1, where it is 2.9
+/* ln of the efficiency 1/(relMSE x seconds) at the last look. Of the repeats the table knows the extremes. They are
+   6, whose range is 6.2 times the standard error of their mean if they are normal, or 3 with QUICK=1, where it is 2.9
    times; a fifth and a third leave room for those that are not. */
 static double efficiency(const table *t, const char *scene, const char *curve, double *error)
 {
