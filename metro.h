@@ -13031,21 +13031,23 @@ static size_t metroi_log_size(size_t entries)
     return (sizeof(metroi_log) + entries * sizeof(metroi_log_entry) + 15) / 16 * 16;
 }
 
-static void metroi_log_add(metroi_log *log, const metroi_splat *splat, double weight)
+/* Returns the luminance that is added: 0 for what is not finite, or not as a float. */
+static double metroi_log_add(metroi_log *log, const metroi_splat *splat, double weight)
 {
     metroi_log_entry *entry = &log->entry[log->count];
     metro_vec3 color = metro_scale(splat->color, weight);
-    if (!isfinite(metroi_color_sum(color))) {
+    entry->color[0] = metroi_float(color.x);
+    entry->color[1] = metroi_float(color.y);
+    entry->color[2] = metroi_float(color.z);
+    if (!isfinite(entry->color[0]) || !isfinite(entry->color[1]) || !isfinite(entry->color[2])) {
         log->not_finite++;
-        return;
+        return 0;
     }
-    entry->color[0] = (float)color.x;
-    entry->color[1] = (float)color.y;
-    entry->color[2] = (float)color.z;
     entry->pixel = splat->pixel;
     entry->s = splat->s;
     entry->t = splat->t;
     log->count++;
+    return metroi_color_luminance(color);
 }
 
 /* A canvas holds sums: of the picture, of each way if asked for, and of the luminance of each block of 8 x 8 pixels
@@ -13180,10 +13182,7 @@ static metro_result metroi_path_work(uint64_t job, void *slot, void *user)
     for (; pixel < end; pixel++) {
         double luminance = 0;
         metroi_path_pixel(plan, &rng, pixel, round, sample);
-        for (i = 0; i < sample->count; i++) {
-            metroi_log_add(log, &sample->splat[i], 1);
-            luminance += metroi_color_luminance(sample->splat[i].color);
-        }
+        for (i = 0; i < sample->count; i++) luminance += metroi_log_add(log, &sample->splat[i], 1);
         log->samples++;
         log->rays += sample->rays;
         log->luminance += luminance;
