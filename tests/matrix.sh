@@ -126,9 +126,12 @@ suite() {
 export METRO_TEST_SCALE=0.2
 have gcc && suite "gcc -O3 -march=native -std=gnu99" "gcc -std=gnu99 -O3 -march=native"
 have clang && suite "clang -O2" "clang -std=c99 -O2"
+export METRO_TEST_SCALE=0.1
 have g++ && suite "g++ -std=c++11" "g++ -x c++ -std=c++11 -O1"
 have musl-gcc && suite "musl, static" "musl-gcc -std=c99 -O2 -static"
+export METRO_TEST_SCALE=0.05 # tcc does not optimise
 have tcc && suite "tcc" "tcc"
+export METRO_TEST_SCALE=0.1
 if have clang && clang -fsanitize=address,undefined -o "$work/a.out" "$work/all.c" -lm > /dev/null 2>&1; then
     UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 ASAN_OPTIONS=detect_leaks=1:allocator_may_return_null=1
     export UBSAN_OPTIONS ASAN_OPTIONS
