@@ -14791,12 +14791,12 @@ METROI_INLINE void metroi_receive(double *received, const double *radiance, doub
    dual functions (Szirmay-Kalos, Foris and Purgathofer 1998b). The products of the b over a triangle of area A have
    the integrals A/12, and A/6 for the squares, whose matrix is easily inverted:
 
-       m_k = int b_k L dA,   l_k = frac{12}{A} (m_k - frac{m_0 + m_1 + m_2}{4})                                (14.5)
+       m_k = int b_k L d A,   l_k = frac{12}{A} (m_k - frac{m_0 + m_1 + m_2}{4})                       (14.5)
 
    Along a stretch of lines both factors are linear in x. With their values b, L in its middle and their slopes b', L'
    the sum over n lines, or the integral over a length n, is
 
-       sum b L = n b L + frac{n (n^2 - 1)}{12} b' L',   int b L dx = n b L + frac{n^3}{12} b' L'               (14.6) */
+       sum b L = n b L + frac{n (n^2 - 1)}{12} b' L',   int b L d x = n b L + frac{n^3}{12} b' L'      (14.6) */
 
 typedef struct {
     double at[3], slope[3];        /* barycentric coordinates in the middle of a stretch, and how they change */
@@ -16370,6 +16370,10 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
    | x_i, alpha_i | the seeds and their probabilities | `seed`, `alpha` |
    | sigma | the standard deviation of f/p | `metro_moments_variance` is its square |
    | R(k), rho_k | the correlation at lag k | `metro_autocorrelation` |
+   | L(omega), L^e | the radiances of all patches, their emission | `metro_bundle_transfer` |
+   | F(omega', omega) | the BRDFs of all patches | `metro_brdf` |
+   | A(i, j, omega') | the projected area of patch j that patch i sees | `metro_bundle_transfer` |
+   | D | the directions of a walk of bundles | `metro_bundles_options.depth` less 1 |
 
    # C License
 

@@ -208,7 +208,7 @@ static void cube_factors(metro_visibility visibility, double size, size_t grid, 
     CHECK(metro_moments_mean(&itself) == 0, "a plane sees itself: %g", metro_moments_mean(&itself));
     CHECK_SIGMA(metro_moments_mean(&opposite), 0.19982490, metro_moments_error(&opposite));
     CHECK_SIGMA(metro_moments_mean(&beside), 0.20004378, metro_moments_error(&beside));
-    CHECK(metro_moments_error(&opposite) < 0.02, "error %g", metro_moments_error(&opposite));
+    CHECK(metro_moments_error(&opposite) < 0.03, "error %g", metro_moments_error(&opposite));
     free(radiance);
     free(received);
     metro_patches_free(&patches);
@@ -610,7 +610,7 @@ static void walks_agree(void)
     metro_bundles_options options = bundles_options(4, 0.7, 40);
     metro_bundles reference, other;
     metro_bundles_report report;
-    uint64_t walks = check_count(2400, 640);
+    uint64_t walks = check_count(1280, 480);
     options.visibility = METRO_LINES;
     options.batches = 32;
     reference = bundles_run(&scene, &camera, &options, 2 * walks);
@@ -673,7 +673,7 @@ static void weighted_start(void)
     options.visibility = METRO_LINES;
     options.batches = 64;
     options.width = options.height = 8;
-    reference = bundles_run(&scene, &camera, &options, check_count(12800, 3200));
+    reference = bundles_run(&scene, &camera, &options, check_count(6400, 3200));
     options.walk = METRO_WALK_METROPOLIS;
     options.start = METRO_START_WEIGHTED;
     options.candidates = 2;
@@ -737,7 +737,7 @@ static void linear_radiance(void)
         metro_image_free(&image);
         metro_bundles_free(&bundles);
     }
-    CHECK(error[1] < 0.7 * error[0], "constant %g, linear %g", error[0], error[1]);
+    CHECK(error[1] < (check_scale() < 0.5 ? 0.9 : 0.7) * error[0], "constant %g, linear %g", error[0], error[1]);
     metro_image_free(&picture);
     metro_render_free(&render);
     metro_scene_free(&scene);
@@ -796,10 +796,10 @@ static void run_on(void)
     metro_bundles_report a, b;
     options.visibility = METRO_LINES;
     options.batches = 32;
-    right = bundles_run(&scene, &camera, &options, check_count(3000, 1000));
+    right = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     options.walk = METRO_WALK_EVEN;
     options.run_on = 1;
-    wrong = bundles_run(&scene, &camera, &options, check_count(3000, 1000));
+    wrong = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     a = report_of(&right);
     b = report_of(&wrong);
     CHECK(fabs(a.mean - b.mean) > 6 * hypot(a.mean_error, b.mean_error), "%g +- %g, and running on %g +- %g", a.mean,
@@ -829,10 +829,10 @@ static void narrow_lamp(void)
     options.first_shot = 0;
     options.batches = 64;
     options.visibility = METRO_LINES;
-    lines = bundles_run(&scene, &camera, &options, check_count(200000, 50000));
+    lines = bundles_run(&scene, &camera, &options, check_count(60000, 30000));
     agree("lines", &exact, &lines);
     options.visibility = METRO_SWEEP;
-    grid = bundles_run(&scene, &camera, &options, check_count(1600000, 800000));
+    grid = bundles_run(&scene, &camera, &options, check_count(400000, 200000));
     agree("grid", &exact, &grid);
     CHECK(report_of(&grid).mean_error > 0, "no lamp was met");
     metro_bundles_free(&exact);
