@@ -71,11 +71,12 @@ docs: build/weave
 check: $(TESTS) build/weave docs
 	@CC="$(CC)" sh tests/matrix.sh
 
-bench: build/bench_laboratory build/bench_light
+bench: build/bench_laboratory build/bench_light build/bench_bundles
 	@build/bench_laboratory
 	@sh tests/bench_compile.sh
 	@sh tests/bench_bvh.sh
 	@build/bench_light
+	@build/bench_bundles
 
 calibrate: build/calibrate_laboratory build/calibrate_light
 	@build/calibrate_laboratory

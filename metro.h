@@ -1510,6 +1510,7 @@ typedef struct {
                                    direction to the next, and converges to a wrong picture */
     int first_shot;             /* the light of the lamps is brought to each patch by a shadow ray in each walk, and
                                    bundles move the rest; a walk has one direction less */
+    int linear;                 /* METRO_SWEEP, METRO_LINES: radiance is linear over each patch, not constant */
     size_t batches;             /* independent replicates, or chains, whose spread gives the errors, 2 to 4096: 16 */
     uint64_t seed;
     uint64_t part;              /* the number of this share of a larger run: shares are independent */
@@ -14683,12 +14684,14 @@ typedef struct {
     double at, step;      /* the next border, and the distance between borders */
     int32_t left;         /* how many there are still */
     int32_t move, turn;   /* what passing it adds to the number of the patch, and how that changes each time */
+    int32_t move_i, move_j;
 } metroi_borders;
 
 typedef struct {
     metroi_borders family[3];  /* the first is the one with a sign of its own */
     double next;
     uint32_t patch;
+    int32_t i, j, k;           /* kept for radiance that is linear */
     int alone;                 /* the next border is of the first family */
 } metroi_stairs;
 
@@ -14717,8 +14720,9 @@ typedef struct {
     size_t grid, rows;         /* rows and columns with their margin */
     double touch;
     metro_visibility visibility;
-    double *radiance;          /* [4 * count], the fourth always 1 */
-    double *received;          /* [4 * count]: sums over lines */
+    size_t nodes;              /* values a patch: 1, or 3 where radiance is linear */
+    double *radiance;          /* [4 * nodes * count], the fourth always 1 */
+    double *received;          /* [4 * nodes * count]: sums over lines */
     metroi_shadow *shadow;     /* [triangle_count] */
     uint32_t *begin;           /* [rows]: the first triangle that begins in a row */
     metroi_shadow **row, **pile; /* [triangle_count]: the spans of a row; those above each other */
@@ -14772,6 +14776,8 @@ METROI_INLINE metroi_borders metroi_borders_make(const metroi_shadow *shadow, in
     borders.at = borders.left > 0 && borders.step < METROI_INFINITY ? at + first * borders.step : METROI_INFINITY;
     borders.move = up ? 1 : -1;
     borders.turn = 0;
+    borders.move_i = kind == 0 ? borders.move : 0;
+    borders.move_j = kind == 1 ? borders.move : 0;
     if (kind == 0) { /* to the next row of patches, eq 14.2 */
         borders.move = up ? 2 * (n - i - 1) : -2 * (n - i);
         borders.turn = -2;
@@ -14797,6 +14803,7 @@ static void metroi_stairs_make(metroi_shadow *shadow, double y, int whole_lines)
     shadow->ready = 1;
     stairs->patch = shadow->first;
     stairs->next = METROI_INFINITY;
+    stairs->i = stairs->j = stairs->k = 0;
     if (shadow->cuts == 1) return;
     value[0] = dx * shadow->s_x + dy * shadow->s_y;
     value[1] = dx * shadow->t_x + dy * shadow->t_y;
@@ -14806,6 +14813,9 @@ static void metroi_stairs_make(metroi_shadow *shadow, double y, int whole_lines)
     whole[1] = j;
     whole[2] = i + j + k;
     stairs->patch += metroi_patch_number(shadow->cuts, i, j, k);
+    stairs->i = i;
+    stairs->j = j;
+    stairs->k = k;
     for (f = 0; f < 3; f++) {
         int kind = shadow->kind[f];
         stairs->family[f] = metroi_borders_make(shadow, kind, at, value[kind], whole[kind], i);
@@ -14819,6 +14829,9 @@ METROI_INLINE void metroi_stairs_step(metroi_stairs *stairs, int whole_lines)
     metroi_borders *passed = &stairs->family[0];
     if (!stairs->alone) passed += stairs->family[1].at < stairs->family[2].at ? 1 : 2;
     stairs->patch += (uint32_t)passed->move;
+    stairs->i += passed->move_i;
+    stairs->j += passed->move_j;
+    stairs->k = !stairs->k;
     passed->move += passed->turn;
     passed->at = --passed->left > 0 ? passed->at + passed->step : METROI_INFINITY;
     stairs->alone = !stairs->alone;
@@ -14835,21 +14848,82 @@ METROI_INLINE void metroi_receive(double *received, const double *radiance, doub
     received[3] += lines * radiance[3];
 }
 
+/* Radiance may also be linear over a patch, given by its values $l_k$ at the three corners: $L = b_0 l_0 + b_1 l_1 +
+   b_2 l_2$ with the barycentric coordinates b of the patch. What arrives is then projected back to such values, by
+   dual functions (Szirmay-Kalos, Foris and Purgathofer 1998b). The products of the b over a triangle of area A have
+   the integrals A/12, and A/6 for the squares, whose matrix is easily inverted:
+
+       m_k = int b_k L d A,   l_k = frac{12}{A} (m_k - frac{m_0 + m_1 + m_2}{4})                       (14.5)
+
+   Along a stretch of lines both factors are linear in x. With their values b, L in its middle and their slopes b', L'
+   the sum over n lines, or the integral over a length n, is
+
+       sum b L = n b L + frac{n (n^2 - 1)}{12} b' L',   int b L d x = n b L + frac{n^3}{12} b' L'      (14.6) */
+
+typedef struct {
+    double at[3], slope[3];        /* barycentric coordinates in the middle of a stretch, and how they change */
+    double light[4], light_slope[4];
+} metroi_stretch;
+
+static void metroi_stretch_see(const metroi_bundle *bundle, const metroi_shadow *shadow, double x, double y,
+                               metroi_stretch *stretch)
+{
+    const metroi_stairs *stairs = &shadow->stairs;
+    const double *radiance = bundle->radiance + 12 * (size_t)stairs->patch;
+    double dx = x - shadow->corner.x, dy = y - shadow->corner.y, sign = stairs->k ? -1 : 1;
+    double u = dx * shadow->s_x + dy * shadow->s_y - (double)stairs->i;
+    double v = dx * shadow->t_x + dy * shadow->t_y - (double)stairs->j;
+    size_t c;
+    /* The corners of section 14.1: at (i, j) and its neighbours, or opposite. */
+    stretch->at[1] = stairs->k ? 1 - u : u;
+    stretch->at[2] = stairs->k ? 1 - v : v;
+    stretch->at[0] = 1 - stretch->at[1] - stretch->at[2];
+    stretch->slope[1] = sign * shadow->s_x;
+    stretch->slope[2] = sign * shadow->t_x;
+    stretch->slope[0] = -stretch->slope[1] - stretch->slope[2];
+    for (c = 0; c < 4; c++) {
+        const double *l = radiance + c;
+        stretch->light[c] = stretch->at[0] * l[0] + stretch->at[1] * l[4] + stretch->at[2] * l[8];
+        stretch->light_slope[c] = stretch->slope[0] * l[0] + stretch->slope[1] * l[4] + stretch->slope[2] * l[8];
+    }
+}
+
+static void metroi_stretch_receive(double *received, const metroi_stretch *a, const metroi_stretch *b, double lines,
+                                   double spread)
+{
+    size_t k, c;
+    for (k = 0; k < 3; k++)
+        for (c = 0; c < 4; c++)
+            received[4 * k + c] += lines * a->at[k] * b->light[c] + spread * a->slope[k] * b->light_slope[c];
+}
+
+static void metroi_stretch_exchange(metroi_bundle *bundle, const metroi_shadow *a, const metroi_shadow *b, double x,
+                                    double end, double y, int whole_lines)
+{
+    double lines = end - x, spread = lines * (lines * lines - (whole_lines ? 1 : 0)) / 12; /* eq 14.6 */
+    metroi_stretch at_a, at_b;
+    metroi_stretch_see(bundle, a, 0.5 * (x + end), y, &at_a);
+    metroi_stretch_see(bundle, b, 0.5 * (x + end), y, &at_b);
+    metroi_stretch_receive(bundle->received + 12 * (size_t)a->stairs.patch, &at_a, &at_b, lines, spread);
+    metroi_stretch_receive(bundle->received + 12 * (size_t)b->stairs.patch, &at_b, &at_a, lines, spread);
+}
+
 /* Two triangles that face each other from x to `end`: their patches exchange what they send, both ways. */
 
 METROI_INLINE void metroi_sweep_exchange(metroi_bundle *bundle, metroi_shadow *a, metroi_shadow *b, double x,
-                                         double end, int whole_lines)
+                                         double end, double y, int whole_lines, int linear)
 {
     while (a->stairs.next <= x) metroi_stairs_step(&a->stairs, whole_lines);
     while (b->stairs.next <= x) metroi_stairs_step(&b->stairs, whole_lines);
     for (;;) {
         size_t i = 4 * (size_t)a->stairs.patch, j = 4 * (size_t)b->stairs.patch;
         double until = metroi_smaller(metroi_smaller(a->stairs.next, b->stairs.next), end);
-        if (until > x) {
+        if (until > x && linear) metroi_stretch_exchange(bundle, a, b, x, until, y, whole_lines);
+        else if (until > x) {
             metroi_receive(bundle->received + i, bundle->radiance + j, until - x);
             metroi_receive(bundle->received + j, bundle->radiance + i, until - x);
-            x = until;
         }
+        x = metroi_larger(x, until);
         if (until >= end) return;
         if (a->stairs.next <= until) metroi_stairs_step(&a->stairs, whole_lines);
         if (b->stairs.next <= until) metroi_stairs_step(&b->stairs, whole_lines);
@@ -14879,7 +14953,7 @@ static void metroi_sweep_lose(metroi_bundle *bundle, metroi_shadow *a, double x,
 /* The pair `low`, `high` in the pile stops being neighbours at x; NULL stands for nothing. */
 
 METROI_INLINE void metroi_sweep_part(metroi_bundle *bundle, metroi_shadow *low, metroi_shadow *high, double x,
-                                     double y, int whole_lines)
+                                     double y, int whole_lines, int linear)
 {
     double since = low != NULL ? low->since : bundle->since;
     int up = low != NULL && low->outline.up, down = high != NULL && !high->outline.up;
@@ -14888,7 +14962,7 @@ METROI_INLINE void metroi_sweep_part(metroi_bundle *bundle, metroi_shadow *low, 
     if (!(x > since) || !(up || down) || !(bundle->balance || (up && down))) return;
     if (up && !low->ready) metroi_stairs_make(low, y, whole_lines);
     if (down && !high->ready) metroi_stairs_make(high, y, whole_lines);
-    if (up && down) metroi_sweep_exchange(bundle, low, high, since, x, whole_lines);
+    if (up && down) metroi_sweep_exchange(bundle, low, high, since, x, y, whole_lines, linear);
     else if (up)
         metroi_sweep_lose(bundle, low, since, x, whole_lines, high == NULL ? bundle->escaped : bundle->absorbed);
     else metroi_sweep_lose(bundle, high, since, x, whole_lines, low == NULL ? bundle->escaped : bundle->absorbed);
@@ -14906,7 +14980,7 @@ METROI_INLINE int metroi_sweep_comes_first(const metroi_bundle *bundle, const me
 
 /* Sweeps the row at y with its `spans` spans, which are in order of their left ends. */
 
-METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double y, int whole_lines)
+METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double y, int whole_lines, int linear)
 {
     metroi_shadow **pile = bundle->pile;
     size_t begun = 0, height = 0, place, i;
@@ -14920,15 +14994,15 @@ METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double 
             metroi_shadow *low = ending > 0 ? pile[ending - 1] : NULL;
             metroi_shadow *high = ending + 1 < height ? pile[ending + 1] : NULL;
             double x = span->right;
-            metroi_sweep_part(bundle, low, span, x, y, whole_lines);
-            metroi_sweep_part(bundle, span, high, x, y, whole_lines);
+            metroi_sweep_part(bundle, low, span, x, y, whole_lines, linear);
+            metroi_sweep_part(bundle, span, high, x, y, whole_lines, linear);
             for (i = ending + 1; i < height; i++) pile[i - 1] = pile[i];
             height--;
         } else {
             metroi_shadow *span = bundle->row[begun++];
             for (place = 0; place < height && metroi_sweep_comes_first(bundle, pile[place], span, y);) place++;
             metroi_sweep_part(bundle, place > 0 ? pile[place - 1] : NULL, place < height ? pile[place] : NULL,
-                              span->left, y, whole_lines);
+                              span->left, y, whole_lines, linear);
             span->since = span->left;
             for (i = height; i > place; i--) pile[i] = pile[i - 1];
             pile[place] = span;
@@ -14994,20 +15068,21 @@ static void metroi_sweep_prepare(metroi_bundle *bundle)
     }
 }
 
-METROI_INLINE void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines)
+METROI_INLINE void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines, int linear)
 {
     size_t live = 0;
     int32_t row;
     metroi_sweep_prepare(bundle);
     for (row = 0; row < (int32_t)bundle->rows; row++) {
         size_t spans = metroi_sweep_cut(bundle, &live, row, whole_lines);
-        metroi_sweep_row(bundle, spans, (double)row + 0.5, whole_lines);
+        metroi_sweep_row(bundle, spans, (double)row + 0.5, whole_lines, linear);
     }
 }
 
 static void metroi_sweep(metroi_bundle *bundle)
 {
-    metroi_sweep_rows(bundle, 1);
+    if (bundle->nodes == 3) metroi_sweep_rows(bundle, 1, 1);
+    else metroi_sweep_rows(bundle, 1, 0);
 }
 
 /* # 14.4 Fragments
@@ -15017,7 +15092,7 @@ static void metroi_sweep(metroi_bundle *bundle)
    the list, sort each line's part by depth, and exchange between neighbours. How long is the list? A convex figure of
    area A and perimeter P holds at most
 
-       A + frac{1}{2} P + 1                                                           (14.5)
+       A + frac{1}{2} P + 1                                                           (14.7)
 
    points of the unit grid (Nosarzewska 1948), and a patch seen at an angle is smaller than one seen from its front.
    */
@@ -15038,7 +15113,7 @@ static size_t metroi_fragments_most(const metro_patches *patches, size_t grid)
         double around = 0;
         for (k = 0; k < 3; k++)
             around += metro_length(metro_subtract(patch->corner[(k + 1) % 3], patch->corner[k]));
-        sum += patch->area * per_cell * per_cell + 0.5 * around * per_cell + 1 + 1e-6; /* eq 14.5 */
+        sum += patch->area * per_cell * per_cell + 0.5 * around * per_cell + 1 + 1e-6; /* eq 14.7 */
     }
     return sum < 4e9 ? (size_t)sum : 0;
 }
@@ -15226,7 +15301,8 @@ static void metroi_painter(metroi_bundle *bundle)
 
 static void metroi_sweep_lines(metroi_bundle *bundle)
 {
-    metroi_sweep_rows(bundle, 0);
+    if (bundle->nodes == 3) metroi_sweep_rows(bundle, 0, 1);
+    else metroi_sweep_rows(bundle, 0, 0);
 }
 
 static void metroi_bundle_free(metroi_bundle *bundle)
@@ -15247,8 +15323,8 @@ static int metroi_bundle_allocate(metroi_bundle *bundle)
 {
     size_t triangles = bundle->patches->scene->triangle_count + 1, count = bundle->patches->count + 1;
     int by_cell = bundle->visibility == METRO_FRAGMENTS || bundle->visibility == METRO_PAINTER;
-    bundle->radiance = (double *)metroi_zeros(count, 4 * sizeof(double));
-    bundle->received = (double *)metroi_zeros(count, 4 * sizeof(double));
+    bundle->radiance = (double *)metroi_zeros(count, 4 * bundle->nodes * sizeof(double));
+    bundle->received = (double *)metroi_zeros(count, 4 * bundle->nodes * sizeof(double));
     if (bundle->radiance == NULL || bundle->received == NULL) return 0;
     if (!by_cell) {
         bundle->shadow = (metroi_shadow *)metroi_zeros(triangles, sizeof *bundle->shadow);
@@ -15270,7 +15346,7 @@ static int metroi_bundle_allocate(metroi_bundle *bundle)
 }
 
 static metro_result metroi_bundle_make(const metro_patches *patches, size_t grid, metro_visibility visibility,
-                                       metroi_bundle *bundle)
+                                       int linear, metroi_bundle *bundle)
 {
     size_t i;
     memset(bundle, 0, sizeof *bundle);
@@ -15279,11 +15355,12 @@ static metro_result metroi_bundle_make(const metro_patches *patches, size_t grid
     bundle->rows = grid + 3; /* the sphere, the shift, and rounding at either end */
     bundle->touch = 1e-7 * (double)grid;
     bundle->visibility = visibility;
+    bundle->nodes = linear ? 3 : 1;
     if (!metroi_bundle_allocate(bundle)) {
         metroi_bundle_free(bundle);
         return METRO_ERROR_MEMORY;
     }
-    for (i = 0; i < patches->count; i++) bundle->radiance[4 * i + 3] = 1;
+    for (i = 0; i < bundle->nodes * patches->count; i++) bundle->radiance[4 * i + 3] = 1;
     return METRO_OK;
 }
 
@@ -15294,7 +15371,7 @@ static void metroi_bundle_move(metroi_bundle *bundle, metro_vec3 direction, cons
     bundle->lines = metroi_rays_make(bundle->patches, direction, bundle->grid, shift);
     bundle->lines.x += 1;
     bundle->lines.y += 1;
-    memset(bundle->received, 0, 4 * bundle->patches->count * sizeof *bundle->received);
+    memset(bundle->received, 0, 4 * bundle->nodes * bundle->patches->count * sizeof *bundle->received);
     memset(bundle->escaped, 0, sizeof bundle->escaped);
     memset(bundle->absorbed, 0, sizeof bundle->absorbed);
     switch (bundle->visibility) {
@@ -15347,7 +15424,7 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
     if (visibility < METRO_SWEEP || visibility > METRO_LINES) return METRO_ERROR_ARGUMENT;
     if (shift == NULL) shift = none;
     if (!(shift[0] >= 0 && shift[0] < 1 && shift[1] >= 0 && shift[1] < 1)) return METRO_ERROR_ARGUMENT;
-    result = metroi_bundle_make(patches, grid, visibility, &bundle);
+    result = metroi_bundle_make(patches, grid, visibility, 0, &bundle);
     if (result != METRO_OK) return result;
     bundle.balance = balance != NULL;
     for (i = 0; i < patches->count; i++) {
@@ -15371,7 +15448,7 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
    their emission again, and what the bundle before brought them, reflected from direction k - 1 into direction k. The
    last bundle is reflected to the eye (paper 3.3):
 
-       x_1 = L^e,   x_{k+1} = L^e + 2 pi F(omega_k, omega_{k+1}) A(omega_k) x_k                              (14.6)
+       x_1 = L^e,   x_{k+1} = L^e + 2 pi F(omega_k, omega_{k+1}) A(omega_k) x_k                              (14.8)
 
    and the walk's estimate is what x_{D+1} has beyond the emission. Written out it is a sum over the bundles in which
    the emission set out: emission of bundle D arrives after one reflection, that of bundle D - 1 after two, that of
@@ -15413,10 +15490,11 @@ typedef struct {
 struct metroi_batch {
     metroi_bundles *plan;
     metroi_bundle bundle;
-    double *out;             /* [3 * count]: what the walk at work sends to the eye */
-    double *sum;             /* [3 * count]: the sum over walks */
+    double *out;             /* [3 * nodes * count]: what the walk at work sends to the eye */
+    double *sum;             /* [3 * nodes * count]: the sum over walks */
     metro_vec3 *lit_from;    /* [count]: after a first shot, where the lamp is, */
-    double *lit;             /* [3 * count]: and its irradiance */
+    double *lit;             /* [3 * count]: its irradiance, */
+    double *lit_share;       /* [3 * count]: and what of it goes to each value of a patch that is linear, or NULL */
     double *state;           /* directions, shifts and the number of the shot */
     metro_chain chain;
     double scale;            /* what the samples of the chain count: Veach's weight, or 1 */
@@ -15450,16 +15528,29 @@ METROI_INLINE metro_vec3 metroi_patch_source(const metroi_batch *batch, const me
     return metro_vec3_make(f.x * lit[0], f.y * lit[1], f.z * lit[2]);
 }
 
+/* What value k of a patch received, times the area of the patch. */
+
+METROI_INLINE double metroi_patch_received(const metroi_bundle *bundle, size_t patch, size_t k, size_t c)
+{
+    const double *m = bundle->received + 4 * bundle->nodes * patch + c;
+    return bundle->nodes == 1 ? m[0] : 12 * m[4 * k] - 3 * (m[0] + m[4] + m[8]); /* eq 14.5 */
+}
+
+METROI_INLINE double metroi_patch_lit(const metroi_batch *batch, size_t patch, size_t k)
+{
+    return batch->lit_share != NULL ? batch->lit_share[3 * patch + k] : 1;
+}
+
 /* Fills the bundle with what all patches send along `out`, of which `in` is the direction of the bundle before, or
-   NULL: eq 14.6. */
+   NULL: eq 14.8. */
 
 static void metroi_walk_send(metroi_batch *batch, const metro_vec3 *in, metro_vec3 out)
 {
     const metroi_bundles *plan = batch->plan;
     const metro_patches *patches = plan->patches;
-    double *radiance = batch->bundle.radiance, *received = batch->bundle.received;
-    double cell = metroi_bundle_cell(&batch->bundle);
-    size_t triangle, patch;
+    const metroi_bundle *bundle = &batch->bundle;
+    double *radiance = bundle->radiance, cell = metroi_bundle_cell(bundle);
+    size_t triangle, patch, k, nodes = bundle->nodes;
     for (triangle = 0; triangle < plan->scene->triangle_count; triangle++) {
         const metroi_surface *surface = metroi_surface_of(plan, triangle);
         metro_vec3 normal = plan->facet[triangle].normal, to, f = metro_vec3_make(0, 0, 0);
@@ -15472,9 +15563,12 @@ static void metroi_walk_send(metroi_batch *batch, const metro_vec3 *in, metro_ve
         }
         for (patch = first; patch < end; patch++) {
             metro_vec3 source = metroi_patch_source(batch, surface, normal, to, patch);
-            radiance[4 * patch] = source.x + f.x * received[4 * patch];
-            radiance[4 * patch + 1] = source.y + f.y * received[4 * patch + 1];
-            radiance[4 * patch + 2] = source.z + f.z * received[4 * patch + 2];
+            for (k = 0; k < nodes; k++) {
+                double *sent = radiance + 4 * (nodes * patch + k), lit = metroi_patch_lit(batch, patch, k);
+                sent[0] = source.x * lit + f.x * metroi_patch_received(bundle, patch, k, 0);
+                sent[1] = source.y * lit + f.y * metroi_patch_received(bundle, patch, k, 1);
+                sent[2] = source.z * lit + f.z * metroi_patch_received(bundle, patch, k, 2);
+            }
         }
     }
 }
@@ -15484,22 +15578,25 @@ static void metroi_walk_send(metroi_batch *batch, const metro_vec3 *in, metro_ve
 static void metroi_walk_show(metroi_batch *batch, const metro_vec3 *in, double *out)
 {
     const metroi_bundles *plan = batch->plan;
-    const double *received = batch->bundle.received;
-    double cell = 2 * METROI_PI * metroi_bundle_cell(&batch->bundle);
-    size_t i;
+    const metroi_bundle *bundle = &batch->bundle;
+    double cell = 2 * METROI_PI * metroi_bundle_cell(bundle);
+    size_t i, k, nodes = bundle->nodes;
+    memset(out, 0, 3 * nodes * plan->patches->count * sizeof *out);
     for (i = 0; i < plan->patches->count; i++) {
         const metro_patch *patch = &plan->patches->patch[i];
         const metroi_surface *surface = metroi_surface_of(plan, patch->triangle);
         metro_vec3 eye = plan->to_eye[i], f = surface->diffuse, source = metro_vec3_make(0, 0, 0);
         double scale = in != NULL ? cell / patch->area : 0; /* eq 14.4 */
-        out[3 * i] = out[3 * i + 1] = out[3 * i + 2] = 0;
         if (surface->black) continue;
         if (surface->share < 1 && in != NULL)
             f = metroi_surface_scatter(surface, patch->normal, metroi_front(patch->normal, *in), eye).value;
         if (batch->lit != NULL) source = metroi_patch_source(batch, surface, patch->normal, eye, i);
-        out[3 * i] = source.x + f.x * scale * received[4 * i];
-        out[3 * i + 1] = source.y + f.y * scale * received[4 * i + 1];
-        out[3 * i + 2] = source.z + f.z * scale * received[4 * i + 2];
+        for (k = 0; k < nodes; k++) {
+            double *shown = out + 3 * (nodes * i + k), lit = metroi_patch_lit(batch, i, k);
+            shown[0] = source.x * lit + f.x * scale * metroi_patch_received(bundle, i, k, 0);
+            shown[1] = source.y * lit + f.y * scale * metroi_patch_received(bundle, i, k, 1);
+            shown[2] = source.z * lit + f.z * scale * metroi_patch_received(bundle, i, k, 2);
+        }
     }
 }
 
@@ -15509,7 +15606,7 @@ static void metroi_walk_show(metroi_batch *batch, const metro_vec3 *in, double *
    that it lights brightly differ from walk to walk. Shadow rays do it better (the first shot of Szirmay-Kalos and
    Purgathofer 1998): in each walk one ray goes from a random point p of each patch to a random point y of a lamp, and
 
-       H_i = frac{L^e cos(theta_p) cos(theta_y)}{d^2 p_A} V(p, y)                     (14.7)
+       H_i = frac{L^e cos(theta_p) cos(theta_y)}{d^2 p_A} V(p, y)                     (14.9)
 
    with p_A of eq 11.3 is an unbiased estimate of the mean irradiance of the patch. From there on the patches send
    what they reflect of it in place of their emission, and the walk has one direction less. */
@@ -15543,8 +15640,13 @@ static void metroi_shoot_patch(metroi_batch *batch, size_t i, metro_rng *rng)
     y = metroi_facet_leave(facet, y, metro_scale(d, -1));
     batch->rays++;
     if (metro_scene_occluded(scene, from, metro_subtract(y, from), 0, end)) return;
-    h = cos_p * cos_y / (distance2 * metroi_light_density(scene, glow)); /* eq 14.7 */
+    h = cos_p * cos_y / (distance2 * metroi_light_density(scene, glow)); /* eq 14.9 */
     batch->lit_from[i] = d;
+    if (batch->lit_share != NULL) { /* eq 14.5 for a single point, whose density is 1/A */
+        batch->lit_share[3 * i] = 12 * (1 - root) - 3;
+        batch->lit_share[3 * i + 1] = 12 * root * (1 - v) - 3;
+        batch->lit_share[3 * i + 2] = 12 * root * v - 3;
+    }
     batch->lit[3 * i] = h * glow->emission.x;
     batch->lit[3 * i + 1] = h * glow->emission.y;
     batch->lit[3 * i + 2] = h * glow->emission.z;
@@ -15580,10 +15682,10 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
    dimensions. Such a sequence mirrors the digits of the number of the point, in base 2 for one coordinate and in base
    3 for the other (Halton 1960):
 
-       h_b(n_1 + n_2 b + n_3 b^2 + ...) = frac{n_1}{b} + frac{n_2}{b^2} + frac{n_3}{b^3} + ...               (14.8)
+       h_b(n_1 + n_2 b + n_3 b^2 + ...) = frac{n_1}{b} + frac{n_2}{b^2} + frac{n_3}{b^3} + ...               (14.10)
 
    But then every other point has the first coordinate of the one before it, plus 1/2: neighbours avoid each other.
-   The second direction of a walk is never near the first, however many walks are made, and the products of eq 14.6
+   The second direction of a walk is never near the first, however many walks are made, and the products of eq 14.8
    are integrated over a part of the space only. The picture converges, and it is wrong. A random shift of the whole
    sequence, modulo 1, makes the batches independent and does not help.
 
@@ -15594,7 +15696,7 @@ static double metroi_halton(uint64_t n, unsigned base)
     double x = 0, digit = 1;
     for (; n > 0; n /= base) {
         digit /= base;
-        x += digit * (double)(n % base); /* eq 14.8 */
+        x += digit * (double)(n % base); /* eq 14.10 */
     }
     return x;
 }
@@ -15633,7 +15735,7 @@ static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
     (void)slot;
     metroi_walk_choose(batch, job / plan->options->batches, metroi_mix(plan->key + index), &rng);
     metroi_bundles_walk(batch, batch->state, &rng, batch->out);
-    for (i = 0; i < 3 * plan->patches->count; i++) batch->sum[i] += batch->out[i];
+    for (i = 0; i < 3 * batch->bundle.nodes * plan->patches->count; i++) batch->sum[i] += batch->out[i];
     return METRO_OK;
 }
 
@@ -15644,7 +15746,7 @@ static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
    numbers the shadow rays. The importance is the luminance that the walk adds to the picture: with $v_i$ the share of
    the picture that shows patch i, and $Y_i$ the luminance of what it sends to the eye,
 
-       I = sum_{i} v_i Y_i                                                            (14.9)
+       I = sum_{i} v_i Y_i                                                            (14.11)
 
    A mutation perturbs all directions inside a cone, or one of them; the grids move by up to as much as the rim of the
    scene does. What a state adds to the sums is its contribution over I, and the sums are scaled by b (eq 4.1).
@@ -15654,6 +15756,16 @@ static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
 
    [figure: fig8.svg | Error against walks: Metropolis walks with several sizes, random and even walks (figure 8 of
    the paper).] */
+
+/* The luminance of patch i: of the mean of its values. */
+
+static double metroi_patch_luminance(const double *out, size_t nodes, size_t i)
+{
+    double sum = 0;
+    size_t k;
+    for (k = nodes * i; k < nodes * (i + 1); k++) sum += metro_luminance(out[3 * k], out[3 * k + 1], out[3 * k + 2]);
+    return sum / (double)nodes;
+}
 
 static double metroi_walk_importance(const double *z, void *sample, void *user)
 {
@@ -15667,8 +15779,8 @@ static double metroi_walk_importance(const double *z, void *sample, void *user)
     shots = metro_rng_make(plan->key, number);
     metroi_bundles_walk(batch, z, &shots, out);
     for (i = 0; i < count; i++)
-        importance += plan->share[i] * metro_luminance(out[3 * i], out[3 * i + 1], out[3 * i + 2]); /* eq 14.9 */
-    out[3 * count] = importance;
+        importance += plan->share[i] * metroi_patch_luminance(out, batch->bundle.nodes, i); /* eq 14.11 */
+    out[3 * batch->bundle.nodes * count] = importance;
     return importance;
 }
 
@@ -15676,7 +15788,7 @@ static void metroi_walk_record(const void *sample, double weight, void *user)
 {
     metroi_batch *batch = (metroi_batch *)user;
     const double *out = (const double *)sample;
-    size_t count = 3 * batch->plan->patches->count, i;
+    size_t count = 3 * batch->bundle.nodes * batch->plan->patches->count, i;
     weight *= batch->scale / out[count]; /* eq 4.1 */
     for (i = 0; i < count; i++) batch->sum[i] += weight * out[i];
 }
@@ -15718,7 +15830,7 @@ static metro_result metroi_walk_chain(metroi_batch *batch, uint64_t index)
     memset(&target, 0, sizeof target);
     target.axes = plan->axis;
     target.axis_count = plan->axis_count;
-    target.sample_size = (3 * plan->patches->count + 1) * sizeof(double);
+    target.sample_size = (3 * batch->bundle.nodes * plan->patches->count + 1) * sizeof(double);
     target.importance = metroi_walk_importance;
     target.record = metroi_walk_record;
     target.propose = plan->options->one_direction ? metroi_walk_propose_one : NULL;
@@ -15783,28 +15895,25 @@ static metro_result metroi_walk_step(uint64_t job, void *slot, void *user)
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
 
-/* The triangle and the patch that the ray through (x, y) sees from its front; the number of patches if there is none.
-   */
+/* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
+   none. */
 
-static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y, uint32_t *triangle)
+static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y, metro_hit *hit)
 {
     metro_vec3 direction = metroi_camera_direction(&plan->camera, x, y);
-    metro_hit hit;
-    if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, &hit)
-        || !(metro_dot(plan->facet[hit.triangle].normal, direction) < 0))
+    if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, hit)
+        || !(metro_dot(plan->facet[hit->triangle].normal, direction) < 0))
         return plan->patches->count;
-    *triangle = hit.triangle;
-    return metro_patches_at(plan->patches, hit.triangle, hit.u, hit.v);
+    return metro_patches_at(plan->patches, hit->triangle, hit->u, hit->v);
 }
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
     size_t width = 2 * plan->options->width, height = 2 * plan->options->height, x, y;
-    uint32_t triangle;
+    metro_hit hit;
     for (y = 0; y < height; y++)
         for (x = 0; x < width; x++) {
-            size_t patch =
-                metroi_bundles_look(plan, 0.5 * ((double)x + 0.5), 0.5 * ((double)y + 0.5), &triangle);
+            size_t patch = metroi_bundles_look(plan, 0.5 * ((double)x + 0.5), 0.5 * ((double)y + 0.5), &hit);
             if (patch < plan->patches->count) share[patch] += 1 / ((double)width * (double)height);
         }
 }
@@ -15820,6 +15929,7 @@ static void metroi_bundles_free(metroi_bundles *plan)
         METRO_FREE(batch->sum);
         METRO_FREE(batch->lit_from);
         METRO_FREE(batch->lit);
+        METRO_FREE(batch->lit_share);
         METRO_FREE(batch->state);
     }
     METRO_FREE(plan->batch);
@@ -15866,6 +15976,8 @@ static metro_result metroi_bundles_check(const metro_scene *scene, const metro_c
     if (options->visibility < METRO_SWEEP || options->visibility > METRO_LINES) return METRO_ERROR_ARGUMENT;
     if (options->walk < METRO_WALK_RANDOM || options->walk > METRO_WALK_METROPOLIS) return METRO_ERROR_ARGUMENT;
     if (options->start < METRO_START_SEEDS || options->start > METRO_START_WEIGHTED) return METRO_ERROR_ARGUMENT;
+    if (options->linear && options->visibility != METRO_SWEEP && options->visibility != METRO_LINES)
+        return METRO_ERROR_ARGUMENT;
     if (options->batches < 2 || options->batches > METROI_LARGEST_CHAINS) return METRO_ERROR_ARGUMENT;
     if (!(options->large_step >= 0 && options->large_step <= 1)) return METRO_ERROR_ARGUMENT;
     if (!(options->perturbation > 0 && isfinite(options->perturbation))) return METRO_ERROR_ARGUMENT;
@@ -15898,16 +16010,20 @@ static metro_result metroi_batch_make(metroi_bundles *plan, size_t index)
     metro_result result;
     batch->plan = plan;
     batch->scale = 1;
-    result = metroi_bundle_make(plan->patches, options->grid, options->visibility, &batch->bundle);
+    result = metroi_bundle_make(plan->patches, options->grid, options->visibility, options->linear, &batch->bundle);
     if (result != METRO_OK) return result;
-    batch->out = (double *)metroi_zeros(count, 3 * sizeof(double));
-    batch->sum = (double *)metroi_zeros(count, 3 * sizeof(double));
+    batch->out = (double *)metroi_zeros(count, 3 * batch->bundle.nodes * sizeof(double));
+    batch->sum = (double *)metroi_zeros(count, 3 * batch->bundle.nodes * sizeof(double));
     batch->state = (double *)metroi_zeros(5 * plan->directions + 1, sizeof(double));
     if (batch->out == NULL || batch->sum == NULL || batch->state == NULL) return METRO_ERROR_MEMORY;
     if (options->first_shot) {
         batch->lit = (double *)metroi_zeros(count, 3 * sizeof(double));
         batch->lit_from = (metro_vec3 *)metroi_zeros(count, sizeof *batch->lit_from);
         if (batch->lit == NULL || batch->lit_from == NULL) return METRO_ERROR_MEMORY;
+    }
+    if (options->first_shot && options->linear) {
+        batch->lit_share = (double *)metroi_zeros(count, 3 * sizeof(double));
+        if (batch->lit_share == NULL) return METRO_ERROR_MEMORY;
     }
     return options->walk == METRO_WALK_METROPOLIS ? metroi_walk_chain(batch, index) : METRO_OK;
 }
@@ -16072,39 +16188,49 @@ static metroi_bundles_scale metroi_bundles_scale_of(const metroi_bundles *plan)
     return scale;
 }
 
-/* One number of the result from that of all batches: their mean, and its error. */
+/* One number of the result from that of all batches: their mean, and its error. It is the mean of `count` sums that
+   are a colour apart, the values of a patch. */
 
 static double metroi_bundles_number(const metroi_bundles *plan, const metroi_bundles_scale *scale, size_t index,
-                                    double *error)
+                                    size_t count, double *error)
 {
     metro_moments moments;
     double mean, spread;
-    size_t i;
+    size_t i, k;
     memset(&moments, 0, sizeof moments);
-    for (i = 0; i < plan->options->batches; i++)
-        if (scale->all || plan->batch[i].alive)
-            metro_moments_add(&moments, scale->scale * plan->batch[i].sum[index]);
+    for (i = 0; i < plan->options->batches; i++) {
+        double value = 0;
+        for (k = 0; k < count; k++) value += plan->batch[i].sum[index + 3 * k];
+        if (scale->all || plan->batch[i].alive) metro_moments_add(&moments, scale->scale * value / (double)count);
+    }
     mean = metro_moments_mean(&moments);
     spread = metro_moments_error(&moments);
     *error = sqrt(spread * spread + mean * mean * scale->b_share * scale->b_share);
     return mean;
 }
 
-METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error)
+/* The means of `values` groups of `count` values each. */
+
+static void metroi_bundles_numbers(const metroi_bundles *plan, size_t values, size_t count, metro_vec3 *radiance,
+                                   metro_vec3 *error)
 {
-    const metroi_bundles *plan = (const metroi_bundles *)bundles->state;
-    metroi_bundles_scale scale;
+    metroi_bundles_scale scale = metroi_bundles_scale_of(plan);
     size_t i;
-    if (plan == NULL || plan->rounds == 0 || radiance == NULL) return METRO_ERROR_ARGUMENT;
-    scale = metroi_bundles_scale_of(plan);
-    for (i = 0; i < plan->patches->count; i++) {
+    for (i = 0; i < values; i++) {
         metro_vec3 mean, spread;
-        mean.x = metroi_bundles_number(plan, &scale, 3 * i, &spread.x);
-        mean.y = metroi_bundles_number(plan, &scale, 3 * i + 1, &spread.y);
-        mean.z = metroi_bundles_number(plan, &scale, 3 * i + 2, &spread.z);
+        mean.x = metroi_bundles_number(plan, &scale, 3 * count * i, count, &spread.x);
+        mean.y = metroi_bundles_number(plan, &scale, 3 * count * i + 1, count, &spread.y);
+        mean.z = metroi_bundles_number(plan, &scale, 3 * count * i + 2, count, &spread.z);
         radiance[i] = mean;
         if (error != NULL) error[i] = spread;
     }
+}
+
+METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error)
+{
+    const metroi_bundles *plan = (const metroi_bundles *)bundles->state;
+    if (plan == NULL || plan->rounds == 0 || radiance == NULL) return METRO_ERROR_ARGUMENT;
+    metroi_bundles_numbers(plan, plan->patches->count, plan->options->linear ? 3 : 1, radiance, error);
     return METRO_OK;
 }
 
@@ -16112,11 +16238,26 @@ METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metr
 
 typedef struct {
     const metroi_bundles *plan;
-    const metro_vec3 *radiance;
+    const metro_vec3 *radiance; /* of all values of the patches */
     metro_image *image;
 } metroi_gather;
 
 enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
+
+/* The radiance at a hit of a patch: that of the patch, or linear between its corners. */
+
+static metro_vec3 metroi_gather_at(const metroi_gather *gather, size_t patch, const metro_hit *hit)
+{
+    const metroi_bundles *plan = gather->plan;
+    const metro_vec3 *value = gather->radiance + 3 * patch;
+    int32_t n = (int32_t)plan->patches->cuts[hit->triangle], i, j, k;
+    double u = hit->u * (double)n, v = hit->v * (double)n;
+    if (!plan->options->linear) return gather->radiance[patch];
+    metroi_patch_place(u, v, n, &i, &j, &k);
+    u = k ? (double)(i + 1) - u : u - (double)i; /* the corners of section 14.1 */
+    v = k ? (double)(j + 1) - v : v - (double)j;
+    return metro_add(metro_scale(value[0], 1 - u - v), metro_add(metro_scale(value[1], u), metro_scale(value[2], v)));
+}
 
 static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
 {
@@ -16127,12 +16268,12 @@ static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
     int i, j;
     for (j = 0; j < side; j++)
         for (i = 0; i < side; i++) {
-            uint32_t triangle = 0;
             metro_vec3 seen;
+            metro_hit hit;
             size_t patch = metroi_bundles_look(plan, (double)x + (i + 0.5) / side, (double)y + (j + 0.5) / side,
-                                               &triangle);
+                                               &hit);
             if (patch >= plan->patches->count) continue;
-            seen = metro_add(gather->radiance[patch], metroi_surface_of(plan, triangle)->emission);
+            seen = metro_add(metroi_gather_at(gather, patch, &hit), metroi_surface_of(plan, hit.triangle)->emission);
             pixel[0] += share * seen.x;
             pixel[1] += share * seen.y;
             pixel[2] += share * seen.z;
@@ -16157,12 +16298,14 @@ METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_i
     metro_image made;
     metro_vec3 *radiance;
     metro_result result;
+    size_t values;
     if (plan == NULL || plan->rounds == 0 || image == NULL) return METRO_ERROR_ARGUMENT;
-    radiance = (metro_vec3 *)metroi_zeros(plan->patches->count + 1, sizeof *radiance);
+    values = plan->patches->count * (plan->options->linear ? 3 : 1);
+    radiance = (metro_vec3 *)metroi_zeros(values + 1, sizeof *radiance);
     if (radiance == NULL) return METRO_ERROR_MEMORY;
     result = metro_image_make(plan->options->width, plan->options->height, 3, &made);
     if (result == METRO_OK) {
-        metro_bundles_radiance(bundles, radiance, NULL);
+        metroi_bundles_numbers(plan, values, 1, radiance, NULL);
         gather.plan = plan;
         gather.radiance = radiance;
         gather.image = &made;
@@ -16192,7 +16335,7 @@ static double metroi_bundles_mean(const metroi_bundles *plan, double *error)
         double luminance = 0;
         if (!scale.all && !plan->batch[b].alive) continue;
         for (i = 0; i < plan->patches->count; i++)
-            luminance += plan->share[i] * metro_luminance(sum[3 * i], sum[3 * i + 1], sum[3 * i + 2]);
+            luminance += plan->share[i] * metroi_patch_luminance(sum, plan->batch[b].bundle.nodes, i);
         metro_moments_add(&moments, scale.scale * luminance);
     }
     mean = metro_moments_mean(&moments);
@@ -16298,6 +16441,10 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
    | alpha | what a walk carries, eq 12.2 | `metroi_vertex.weight` |
    | w_s | the weight of a way to make a path, eq 12.3 | `metroi_heuristic` |
    | A_n, B_n | what a vertex knows of the other ways, eq 12.6 | `metroi_vertex.a`, `.b` |
+   | L(omega), L^e | the radiances of all patches, their emission | `metro_bundle_transfer` |
+   | F(omega', omega) | the BRDFs of all patches | `metro_brdf` |
+   | A(i, j, omega') | the projected area of patch j that patch i sees | `metro_bundle_transfer` |
+   | D | the directions of a walk of bundles | `metro_bundles_options.depth` less 1 |
 
    # C License
 

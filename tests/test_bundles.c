@@ -99,6 +99,14 @@ static metro_bundles_report report_of(const metro_bundles *bundles)
     return report;
 }
 
+static metro_vec3 *radiance_of(const metro_bundles *bundles, metro_vec3 *error)
+{
+    metro_vec3 *radiance = colors_make(&bundles->patches, 0);
+    metro_result result = metro_bundles_radiance(bundles, radiance, error);
+    CHECK(result == METRO_OK, "radiance: %s", metro_result_text(result));
+    return radiance;
+}
+
 /* Two results agree in their mean, within their joint error. */
 static void agree(const char *what, const metro_bundles *a, const metro_bundles *b)
 {
@@ -200,7 +208,7 @@ static void cube_factors(metro_visibility visibility, double size, size_t grid, 
     CHECK(metro_moments_mean(&itself) == 0, "a plane sees itself: %g", metro_moments_mean(&itself));
     CHECK_SIGMA(metro_moments_mean(&opposite), 0.19982490, metro_moments_error(&opposite));
     CHECK_SIGMA(metro_moments_mean(&beside), 0.20004378, metro_moments_error(&beside));
-    CHECK(metro_moments_error(&opposite) < 0.02, "error %g", metro_moments_error(&opposite));
+    CHECK(metro_moments_error(&opposite) < 0.03, "error %g", metro_moments_error(&opposite));
     free(radiance);
     free(received);
     metro_patches_free(&patches);
@@ -209,10 +217,10 @@ static void cube_factors(metro_visibility visibility, double size, size_t grid, 
 
 static void cube_form_factors(void)
 {
-    cube_factors(METRO_SWEEP, 0.5, 48, 6000);
-    cube_factors(METRO_FRAGMENTS, 0.5, 48, 3000);
-    cube_factors(METRO_LINES, 0.5, 24, 6000);
-    cube_factors(METRO_LINES, 5, 6, 6000);
+    cube_factors(METRO_SWEEP, 0.5, 48, 4000);
+    cube_factors(METRO_FRAGMENTS, 0.5, 48, 1500);
+    cube_factors(METRO_LINES, 0.5, 24, 3000);
+    cube_factors(METRO_LINES, 5, 6, 4000);
 }
 
 /* Trap 43: patches a fifth of a cell long. */
@@ -397,8 +405,9 @@ static void special_directions(void)
     metro_scene_free(&scene);
 }
 
-/* Trap 46: the same sheet twice, from both sides, and a box on the floor. A sheet of two triangles back to back shows
-   both its fronts; a floor and what stands on it exchange nothing; the energy is kept whatever the order. */
+/* Trap 46: the same sheet twice, from both sides, and a box on it. A sheet of two triangles back to back shows both
+   its fronts, what stands on it exchanges nothing with it, and the energy is kept whatever the order. Planted: with
+   the touching fronts face to face the sheet sees itself only. */
 static void touching_patches(void)
 {
     metro_scene scene = empty_scene();
@@ -416,6 +425,7 @@ static void touching_patches(void)
     patches = patches_make(&scene, 0.25);
     radiance = colors_make(&patches, 1);
     received = colors_make(&patches, 0);
+    for (i = patches.first[0]; i < patches.first[4]; i++) radiance[i] = grey(0); /* the sheet is dark */
     for (v = 0; v < 4; v++)
         for (n = 0; n < 20; n++) {
             metro_bundle_balance balance;
@@ -465,7 +475,7 @@ static void furnace(void)
             options.visibility = v == 3 ? METRO_LINES : v == 2 ? METRO_SWEEP : (metro_visibility)v;
             options.walk = v == 2 ? METRO_WALK_EVEN : METRO_WALK_RANDOM;
             options.batches = 64;
-            bundles = bundles_run(&scene, &camera, &options, check_count(3200, 640));
+            bundles = bundles_run(&scene, &camera, &options, check_count(v == 1 ? 640 : 1920, 640));
             report = report_of(&bundles);
             CHECK_SIGMA(report.mean, furnace_radiance(rho[r], 2, 2, 5), report.mean_error);
             CHECK(report.mean_error < 0.02 * report.mean, "error %g of %g", report.mean_error, report.mean);
@@ -519,8 +529,8 @@ static void sphere(void)
         metro_bundles_free(&bundles);
     }
     CHECK_SIGMA(metro_moments_mean(&mean), truth, metro_moments_error(&mean));
-    CHECK(fabs(metro_moments_mean(&skew)) < 0.01 * truth + 5.1 * metro_moments_error(&skew), "the halves differ by %g",
-          metro_moments_mean(&skew));
+    CHECK(fabs(metro_moments_mean(&skew)) < 0.01 * truth + 5.1 * metro_moments_error(&skew),
+          "the halves differ by %g", metro_moments_mean(&skew));
     CHECK(metro_moments_error(&mean) < 0.02 * truth && metro_moments_error(&skew) < 0.05 * truth, "errors %g and %g",
           metro_moments_error(&mean), metro_moments_error(&skew));
     metro_scene_free(&scene);
@@ -528,12 +538,13 @@ static void sphere(void)
 
 /* ---- methods against each other ---- */
 
-/* A room with a lamp in its ceiling and two boxes, all diffuse, or with a glossy floor and box. */
+/* A room with a lamp in its ceiling and two boxes, all diffuse, or all partly glossy. */
 static metro_scene room_scene(double gloss)
 {
     metro_scene scene = empty_scene();
     uint32_t side[6], wall[6], i;
-    uint32_t white = add_material(&scene, metro_vec3_make(0.7, 0.6, 0.5), grey(0), 0, grey(0));
+    uint32_t white = add_material(&scene, metro_vec3_make(0.7 - gloss, 0.6 - gloss, 0.5 - gloss), grey(gloss), 3,
+                                  grey(0));
     uint32_t shiny = add_material(&scene, grey(0.6 - gloss), grey(gloss), 6, grey(0));
     uint32_t lamp = add_material(&scene, grey(0), grey(0), 0, metro_vec3_make(9, 8, 7));
     for (i = 0; i < 6; i++) wall[i] = white;
@@ -556,30 +567,40 @@ static void bidirectional_paths(void)
     for (g = 0; g < 2; g++) {
         metro_scene scene = room_scene(g ? 0.5 : 0);
         metro_camera camera = inside_camera();
-        metro_render_options paths = options_make(METRO_BDPT, 32, 4);
-        metro_render render = render_run(&scene, &camera, &paths, check_count(24, 8));
-        metro_image picture = render_image(&render);
+        metro_render_options paths = options_make(METRO_BDPT, 32, 6);
+        metro_render render;
+        metro_image picture;
         metro_render_report seen;
+        paths.shortest = 2;
+        render = render_run(&scene, &camera, &paths, check_count(32, 8));
         metro_render_diagnose(&render, &seen);
+        metro_render_free(&render);
+        paths.shortest = 1;
+        render = render_run(&scene, &camera, &paths, check_count(16, 8));
+        picture = render_image(&render);
         for (shot = 0; shot < 2; shot++) {
-            metro_bundles_options options = bundles_options(4, 0.2, shot ? 60 : 100);
+            metro_bundles_options options = bundles_options(6, 0.2, shot ? 40 : 60);
             metro_bundles bundles;
             metro_bundles_report report;
             metro_image image;
             metro_image_difference difference;
             double error, lamp;
             options.first_shot = shot;
+            options.batches = 32;
             options.visibility = METRO_LINES;
-            bundles = bundles_run(&scene, &camera, &options, check_count(shot ? 192 : 384, 64));
+            bundles = bundles_run(&scene, &camera, &options, check_count(shot ? 512 : 384, 64));
             report = report_of(&bundles);
             memset(&image, 0, sizeof image);
             CHECK(metro_bundles_image(&bundles, &image) == METRO_OK, "image");
             metro_image_error(&image, &picture, &difference);
             error = sqrt(report.mean_error * report.mean_error + seen.mean_error * seen.mean_error);
-            CHECK(fabs(difference.mean - seen.mean) < 0.02 * seen.mean + 5.1 * error, "%g, paths %g +- %g",
-                  difference.mean, seen.mean, error);
+            CHECK(fabs(report.mean - seen.mean) < 0.02 * seen.mean + student_bound(31) * error, "%g, paths %g +- %g",
+                  report.mean, seen.mean, error);
             lamp = difference.mean - report.mean; /* seen directly */
-            CHECK(lamp > 0.02, "the lamp adds %g", lamp);
+            CHECK_CLOSE(lamp, difference.mean_reference - seen.mean, 0.06 * lamp);
+            if (shot)
+                CHECK(report.mean_error < (check_scale() < 0.5 ? 0.2 : 0.03) * report.mean, "error %g of %g",
+                      report.mean_error, report.mean);
             if (shot) CHECK(difference.relative_rmse < 0.25, "the picture is off by %g", difference.relative_rmse);
             metro_image_free(&image);
             metro_bundles_free(&bundles);
@@ -599,7 +620,7 @@ static void walks_agree(void)
     metro_bundles_options options = bundles_options(4, 0.7, 40);
     metro_bundles reference, other;
     metro_bundles_report report;
-    uint64_t walks = check_count(3200, 640);
+    uint64_t walks = check_count(1280, 480);
     options.visibility = METRO_LINES;
     options.batches = 32;
     reference = bundles_run(&scene, &camera, &options, 2 * walks);
@@ -641,6 +662,12 @@ static void walks_agree(void)
     other = bundles_run(&scene, &camera, &options, walks / 2);
     agree("metropolis after a first shot", &reference, &other);
     metro_bundles_free(&other);
+    options.linear = 1;
+    options.large_step = 0;
+    options.one_direction = 0;
+    other = bundles_run(&scene, &camera, &options, walks / 2);
+    agree("linear", &reference, &other);
+    metro_bundles_free(&other);
     metro_bundles_free(&reference);
     metro_scene_free(&scene);
 }
@@ -656,7 +683,7 @@ static void weighted_start(void)
     options.visibility = METRO_LINES;
     options.batches = 64;
     options.width = options.height = 8;
-    reference = bundles_run(&scene, &camera, &options, check_count(12800, 3200));
+    reference = bundles_run(&scene, &camera, &options, check_count(6400, 3200));
     options.walk = METRO_WALK_METROPOLIS;
     options.start = METRO_START_WEIGHTED;
     options.candidates = 2;
@@ -666,6 +693,106 @@ static void weighted_start(void)
     agree("weighted", &reference, &weighted);
     metro_bundles_free(&weighted);
     metro_bundles_free(&reference);
+    metro_scene_free(&scene);
+}
+
+/* Radiance that is linear over the patches: the same light (to the discretisation, which the means hardly see), and
+   fewer patches for the same picture. Planted: corners of the patches turned about taken for those of the others. */
+static void linear_radiance(void)
+{
+    metro_scene scene = room_scene(0), furnace_ = furnace_scene(0.8, 1);
+    metro_camera camera = camera_make(metro_vec3_make(0.1, 0.7, 0.9), metro_vec3_make(0, -1, -0.6), 60);
+    metro_render_options paths = options_make(METRO_BDPT, 32, 3);
+    metro_render render;
+    metro_image picture, image;
+    double error[2];
+    int v, linear;
+    for (v = 0; v < 4; v++) {
+        metro_bundles_options options = bundles_options(3, v < 2 ? 2 : 0.5, v < 2 ? 3 : 16);
+        metro_bundles bundles;
+        metro_bundles_report report;
+        options.linear = 1;
+        options.visibility = v % 2 ? METRO_LINES : METRO_SWEEP;
+        options.batches = 64;
+        bundles = bundles_run(&furnace_, &camera, &options, check_count(3200, 1280));
+        report = report_of(&bundles);
+        CHECK_SIGMA(report.mean, furnace_radiance(0.8, 1, 2, 3), report.mean_error);
+        metro_bundles_free(&bundles);
+    }
+    render = render_run(&scene, &camera, &paths, check_count(64, 24));
+    picture = render_image(&render);
+    for (linear = 0; linear < 2; linear++) {
+        metro_bundles_options options = bundles_options(3, 0.7, 40);
+        metro_bundles bundles;
+        metro_vec3 *radiance;
+        double sum = 0, all = 0;
+        size_t i;
+        options.linear = linear;
+        options.visibility = METRO_LINES;
+        options.first_shot = 1;
+        bundles = bundles_run(&scene, &camera, &options, check_count(640, 320));
+        memset(&image, 0, sizeof image);
+        CHECK(metro_bundles_image(&bundles, &image) == METRO_OK, "image");
+        for (i = 0; i < 32 * 32; i++) {
+            double y = image_luminance(&image, i), truth = image_luminance(&picture, i);
+            sum += (y - truth) * (y - truth);
+            all += truth * truth;
+        }
+        error[linear] = sqrt(sum / all);
+        radiance = radiance_of(&bundles, NULL);
+        for (i = 0, sum = 0; i < bundles.patches.count; i++)
+            sum += bundles.share[i] * metro_luminance(radiance[i].x, radiance[i].y, radiance[i].z);
+        CHECK_NEAR(sum, report_of(&bundles).mean, 1e-9);
+        free(radiance);
+        metro_image_free(&image);
+        metro_bundles_free(&bundles);
+    }
+    CHECK(error[1] < (check_scale() < 0.5 ? 0.9 : 0.7) * error[0], "constant %g, linear %g", error[0], error[1]);
+    metro_image_free(&picture);
+    metro_render_free(&render);
+    metro_scene_free(&scene);
+    metro_scene_free(&furnace_);
+}
+
+/* Between two squares straight above each other a linear radiance arrives as it was sent: eqs 14.5 and 14.6. Planted:
+   without the slopes, or with lumped masses, it arrives flattened. */
+static void linear_is_carried(void)
+{
+    metro_scene scene = empty_scene();
+    metro_patches patches;
+    metroi_bundle bundle;
+    const double shift[2] = { 0.3, 0.6 };
+    int v, c;
+    size_t i, k;
+    add_quad(&scene, grey(0), metro_vec3_make(0, 0, 1), metro_vec3_make(1, 0, 0), 0);
+    add_quad(&scene, metro_vec3_make(0, 0.7, 0), metro_vec3_make(1, 0, 0), metro_vec3_make(0, 0, 1), 0);
+    build(&scene);
+    patches = patches_make(&scene, 0.4);
+    for (v = 0; v < 2; v++) {
+        metro_result result =
+            metroi_bundle_make(&patches, 8001, v ? METRO_LINES : METRO_SWEEP, 1, &bundle);
+        double cell, worst = 0;
+        CHECK(result == METRO_OK, "%s", metro_result_text(result));
+        for (i = 0; i < patches.count; i++)
+            for (k = 0; k < 3; k++)
+                for (c = 0; c < 3; c++) {
+                    metro_vec3 p = patches.patch[i].corner[k];
+                    bundle.radiance[4 * (3 * i + k) + (size_t)c] = 1 + 2 * p.x - 3 * p.z * c;
+                }
+        metroi_bundle_move(&bundle, metro_vec3_make(0, 1, 0), shift);
+        cell = metroi_bundle_cell(&bundle);
+        for (i = 0; i < patches.count; i++)
+            for (k = 0; k < 3; k++)
+                for (c = 0; c < 3; c++) {
+                    metro_vec3 p = patches.patch[i].corner[k];
+                    double got = metroi_patch_received(&bundle, i, k, (size_t)c) * cell / patches.patch[i].area;
+                    double off = fabs(got - (1 + 2 * p.x - 3 * p.z * c));
+                    if (off > worst) worst = off;
+                }
+        CHECK(worst < 0.05, "visibility %d: a corner is off by %g", v, worst);
+        metroi_bundle_free(&bundle);
+    }
+    metro_patches_free(&patches);
     metro_scene_free(&scene);
 }
 
@@ -679,10 +806,10 @@ static void run_on(void)
     metro_bundles_report a, b;
     options.visibility = METRO_LINES;
     options.batches = 32;
-    right = bundles_run(&scene, &camera, &options, check_count(4000, 1000));
+    right = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     options.walk = METRO_WALK_EVEN;
     options.run_on = 1;
-    wrong = bundles_run(&scene, &camera, &options, check_count(4000, 1000));
+    wrong = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     a = report_of(&right);
     b = report_of(&wrong);
     CHECK(fabs(a.mean - b.mean) > 6 * hypot(a.mean_error, b.mean_error), "%g +- %g, and running on %g +- %g", a.mean,
@@ -712,10 +839,10 @@ static void narrow_lamp(void)
     options.first_shot = 0;
     options.batches = 64;
     options.visibility = METRO_LINES;
-    lines = bundles_run(&scene, &camera, &options, check_count(200000, 50000));
+    lines = bundles_run(&scene, &camera, &options, check_count(60000, 30000));
     agree("lines", &exact, &lines);
     options.visibility = METRO_SWEEP;
-    grid = bundles_run(&scene, &camera, &options, check_count(1600000, 800000));
+    grid = bundles_run(&scene, &camera, &options, check_count(400000, 200000));
     agree("grid", &exact, &grid);
     CHECK(report_of(&grid).mean_error > 0, "no lamp was met");
     metro_bundles_free(&exact);
@@ -725,14 +852,6 @@ static void narrow_lamp(void)
 }
 
 /* ---- what a program needs ---- */
-
-static metro_vec3 *radiance_of(const metro_bundles *bundles, metro_vec3 *error)
-{
-    metro_vec3 *radiance = colors_make(&bundles->patches, 0);
-    metro_result result = metro_bundles_radiance(bundles, radiance, error);
-    CHECK(result == METRO_OK, "radiance: %s", metro_result_text(result));
-    return radiance;
-}
 
 /* One, two and three threads, in one call or in several, give the same bits. */
 static void threads(void)
@@ -751,6 +870,7 @@ static void threads(void)
                 metro_vec3 *radiance;
                 options.walk = (metro_walk)walk;
                 options.first_shot = shot;
+                options.linear = shot && walk == 0;
                 options.threads = (size_t)t + 1;
                 bundles = bundles_run(&scene, &camera, &options, t == 1 ? 17 : 64);
                 if (t == 1) metro_bundles_run(&bundles, 32, NULL, NULL);
@@ -850,7 +970,7 @@ static void arguments(void)
     CHECK(metro_bundles_make(&unbuilt, &camera, NULL, &bundles) == METRO_ERROR_ARGUMENT, "not built");
     bad.fov = 0;
     CHECK(metro_bundles_make(&scene, &bad, NULL, &bundles) == METRO_ERROR_ARGUMENT, "no camera");
-    for (k = 0; k < 14; k++) {
+    for (k = 0; k < 15; k++) {
         options = bundles_options(4, 1, 8);
         if (k == 0) options.depth = 1;
         if (k == 1) options.depth = METRO_DEPTH_MOST + 1;
@@ -866,6 +986,10 @@ static void arguments(void)
         if (k == 11) options.perturbation = -1;
         if (k == 12) options.width = SIZE_MAX / 2;
         if (k == 13) options.perturbation = HUGE_VAL;
+        if (k == 14) {
+            options.linear = 1;
+            options.visibility = METRO_FRAGMENTS;
+        }
         CHECK(metro_bundles_make(&scene, &camera, &options, &bundles) == METRO_ERROR_ARGUMENT, "option %d", k);
     }
     add_quad(&unbuilt, grey(0), metro_vec3_make(1, 0, 0), metro_vec3_make(0, 1, 0), 0);
@@ -962,6 +1086,7 @@ static void failing_memory(void)
         metro_image image;
         options.walk = (metro_walk)walk;
         options.first_shot = 1;
+        options.linear = walk == 1;
         options.batches = 3;
         memset(&bundles, 7, sizeof bundles);
         untouched = bundles;
@@ -1015,6 +1140,8 @@ int main(void)
     CHECK_RUN(bidirectional_paths);
     CHECK_RUN(walks_agree);
     CHECK_RUN(weighted_start);
+    CHECK_RUN(linear_is_carried);
+    CHECK_RUN(linear_radiance);
     CHECK_RUN(run_on);
     CHECK_RUN(narrow_lamp);
     CHECK_RUN(threads);
