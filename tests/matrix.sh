@@ -136,7 +136,7 @@ if have clang && clang -fsanitize=address,undefined -o "$work/a.out" "$work/all.
     UBSAN_OPTIONS=halt_on_error=1:print_stacktrace=1 ASAN_OPTIONS=detect_leaks=1:allocator_may_return_null=1
     export UBSAN_OPTIONS ASAN_OPTIONS
     suite "address and undefined behaviour" "clang -std=c99 -O1 -g -fsanitize=address,undefined -fno-sanitize-recover=all"
-    tests_of_threads="test_ground test_chain test_ensemble test_mlt"
+    tests_of_threads="test_ground test_chain test_ensemble test_mlt test_bundles"
     all=$tests
     tests=$(for t in $tests_of_threads; do [ -f "tests/$t.c" ] && echo "$t"; done)
     suite "threads" "clang -std=c99 -O1 -g -fsanitize=thread"
@@ -159,7 +159,7 @@ have clang && rays "clang -O3 -march=native" "clang -std=gnu99 -O3 -march=native
 # long not at all.
 export METRO_TEST_SCALE=0.02
 export METRO_BVH_RAYS=20000
-tests=$(for t in $tests; do case $t in test_mlt | test_paths) ;; *) echo "$t" ;; esac; done)
+tests=$(for t in $tests; do case $t in test_mlt | test_paths | test_bundles) ;; *) echo "$t" ;; esac; done)
 if have valgrind; then
     suite "valgrind" "gcc -std=c99 -O1 -g" "valgrind -q --error-exitcode=9 --leak-check=full"
 else
