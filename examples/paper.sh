@@ -3,7 +3,7 @@
 # Each program uses all cores. The data (CSV), charts (SVG) and pictures (PNG, PFM) go to out/. QUICK=1 makes them small.
 set -u
 programs="hello fig1 fig2 seeds size startup operator picture own failures accuracy
- fig3 fig4 fig5 pyramid colours bias decay costs fig7 fig8 bundles"
+ fig3 fig4 fig5 pyramid colours bias decay costs fig6 fig7 fig8 bundles smoother"
 total=$(echo $programs | wc -w)
 start=$(date +%s)
 done=0
