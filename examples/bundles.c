@@ -20,8 +20,9 @@
    on to improve, and the sequence that runs on stays where it is: it converges to a wrong answer.
 
    Writes out/bundles.svg, one panel of it as out/painter.svg, out/bundles_grid.svg, out/bundles_patches.svg and
-   out/runon.svg, with out/bundles.csv, out/bundles_grid.csv, out/bundles_patches.csv and out/bundles_runon.csv. Columns that end in _se are standard
-   errors. A bias2 is the square of the bias, without noise in the mean, and may come out below 0. */
+   out/runon.svg, with out/bundles.csv, out/bundles_grid.csv, out/bundles_patches.csv and out/bundles_runon.csv.
+   Columns that end in _se are standard errors. A bias2 is the square of the bias, without noise in the mean, and may
+   come out below 0. */
 
 #define _POSIX_C_SOURCE 200809L
 #define METRO_IMPLEMENTATION
@@ -267,8 +268,8 @@ static void transfer_draw(const transfers *t, plot_panel *panel)
 /* The middle panel of the last row alone. */
 static int save_painter(const transfers *t, const char *title)
 {
-    plot_chart chart = plot_chart_make(title, "The Cornell box; each patch sends out a random color. Bars are standard "
-                                              "errors.");
+    plot_chart chart = plot_chart_make(title, "The Cornell box; each patch sends out a random color. Bars are "
+                                              "standard errors.");
     spread_draw(t, &chart.panel[0]);
     return plot_save(&chart, "out/painter.svg");
 }
