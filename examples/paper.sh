@@ -4,7 +4,7 @@
 # Each program uses all cores. The data (CSV), charts (SVG) and pictures (PNG, PFM) go to out/. QUICK=1 makes them small.
 set -u
 programs="hello fig1 fig2 seeds errata size startup operator picture own failures accuracy
- fig3 fig4 fig5 pyramid colours bias decay failures_light costs claims"
+ fig3 fig4 fig5 pyramid colours bias decay failures_light costs fig6 fig7 fig8 bundles smoother whole claims"
 total=$(echo $programs | wc -w)
 start=$(date +%s)
 done=0
