@@ -14805,6 +14805,8 @@ METROI_INLINE void metroi_receive(double *received, const double *radiance, doub
 
        m_k = int b_k L d A,   l_k = frac{12}{A} (m_k - frac{m_0 + m_1 + m_2}{4})                       (14.5)
 
+   Next to a shadow's border such a value may be below 0, and so may a pixel; the mean of a patch never is.
+
    Along a stretch of lines both factors are linear in x. With their values b, L in its middle and their slopes b', L'
    the sum over n lines, or the integral over a length n, is
 
@@ -15084,8 +15086,10 @@ static size_t metroi_outline_cells(const metroi_bundle *bundle, const metroi_out
 {
     double left, right;
     metroi_outline_cut(outline, (double)row + 0.5, &left, &right);
-    *from = (size_t)row * bundle->rows + (size_t)metroi_lines_before(left);
-    return (size_t)row * bundle->rows + (size_t)metroi_lines_before(right);
+    left = metroi_lines_before(left);
+    right = metroi_lines_before(right);
+    *from = (size_t)row * bundle->rows + (size_t)left;
+    return (size_t)row * bundle->rows + (size_t)right;
 }
 
 /* Two neighbours on a line; METROI_NO_PATCH stands for nothing. */
@@ -15470,9 +15474,10 @@ static const metroi_surface *metroi_surface_of(const metroi_bundles *plan, size_
 METROI_INLINE metro_vec3 metroi_patch_source(const metroi_batch *batch, const metroi_surface *surface,
                                              metro_vec3 normal, metro_vec3 out, size_t patch)
 {
-    const double *lit = batch->lit + 3 * patch;
+    const double *lit = batch->lit;
     metro_vec3 f;
-    if (batch->lit == NULL) return surface->emission;
+    if (lit == NULL) return surface->emission;
+    lit += 3 * patch;
     if (surface->black) return metro_vec3_make(0, 0, 0);
     f = surface->share < 1 ? metroi_surface_scatter(surface, normal, batch->lit_from[patch], out).value
                            : surface->diffuse;
