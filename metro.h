@@ -14805,7 +14805,7 @@ METROI_INLINE void metroi_receive(double *received, const double *radiance, doub
 
        m_k = int b_k L d A,   l_k = frac{12}{A} (m_k - frac{m_0 + m_1 + m_2}{4})                       (14.5)
 
-   Next to a shadow's border such a value may be below 0, and so may a pixel; the mean of a patch never is.
+   Next to the border of a shadow such a value may be below 0, and so may a pixel.
 
    Along a stretch of lines both factors are linear in x. With their values b, L in its middle and their slopes b', L'
    the sum over n lines, or the integral over a length n, is
@@ -15702,13 +15702,13 @@ static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
    numbers the shadow rays. The importance is the luminance that the walk adds to the picture: with $v_i$ the share of
    the picture that shows patch i, and $Y_i$ the luminance of what it sends to the eye,
 
-       I = sum_{i} v_i Y_i                                                            (14.11)
+       I = abs(sum_{i} v_i Y_i)                                                       (14.11)
 
    A mutation perturbs all directions inside a cone, or one of them; the grids move by up to as much as the rim of the
    scene does. What a state adds to the sums is its contribution over I, and the sums are scaled by b (eq 4.1).
 
-   A bundle serves the whole picture at once, so its importance varies little from one walk to the next: this is the
-   smooth integrand of which the paper says that Metropolis sampling gains least.
+   Only where radiance is linear can the sum be below 0. A bundle serves the whole picture at once, so the integrand
+   is smoother than that of single paths, and the paper concludes that Metropolis sampling gains less by it.
 
    [figure: fig8.svg | Error against walks: Metropolis walks with several sizes, random and even walks (figure 8 of
    the paper).] */
@@ -15736,6 +15736,7 @@ static double metroi_walk_importance(const double *z, void *sample, void *user)
     metroi_bundles_walk(batch, z, &shots, out);
     for (i = 0; i < count; i++)
         importance += plan->share[i] * metroi_patch_luminance(out, batch->bundle.nodes, i); /* eq 14.11 */
+    importance = fabs(importance);
     out[3 * batch->bundle.nodes * count] = importance;
     return importance;
 }
