@@ -14500,7 +14500,7 @@ typedef struct {
 } metroi_rays;
 
 static metroi_rays metroi_rays_make(const metro_patches *patches, metro_vec3 direction, size_t grid,
-                                      const double *shift)
+                                    const double *shift)
 {
     metroi_rays lines;
     metro_vec3 n = metro_normalize(direction);
