@@ -396,8 +396,7 @@ static void special_directions(void)
                                  radiance, received, &balance);
                         balance_check(&balance);
                         for (i = 0; i < patches.count; i++)
-                            CHECK(received[i].x >= 0 && received[i].x < 8, "patch %zu receives %g", i,
-                                  received[i].x);
+                            CHECK(received[i].x >= 0 && received[i].x < 8, "patch %zu receives %g", i, received[i].x);
                     }
     free(radiance);
     free(received);
@@ -543,8 +542,8 @@ static metro_scene room_scene(double gloss)
 {
     metro_scene scene = empty_scene();
     uint32_t side[6], wall[6], i;
-    uint32_t white = add_material(&scene, metro_vec3_make(0.7 - gloss, 0.6 - gloss, 0.5 - gloss), grey(gloss), 3,
-                                  grey(0));
+    uint32_t white =
+        add_material(&scene, metro_vec3_make(0.7 - gloss, 0.6 - gloss, 0.5 - gloss), grey(gloss), 3, grey(0));
     uint32_t shiny = add_material(&scene, grey(0.6 - gloss), grey(gloss), 6, grey(0));
     uint32_t lamp = add_material(&scene, grey(0), grey(0), 0, metro_vec3_make(9, 8, 7));
     for (i = 0; i < 6; i++) wall[i] = white;
@@ -769,8 +768,7 @@ static void linear_is_carried(void)
     build(&scene);
     patches = patches_make(&scene, 0.4);
     for (v = 0; v < 2; v++) {
-        metro_result result =
-            metroi_bundle_make(&patches, 8001, v ? METRO_LINES : METRO_SWEEP, 1, &bundle);
+        metro_result result = metroi_bundle_make(&patches, 8001, v ? METRO_LINES : METRO_SWEEP, 1, &bundle);
         double cell, worst = 0;
         CHECK(result == METRO_OK, "%s", metro_result_text(result));
         for (i = 0; i < patches.count; i++)
