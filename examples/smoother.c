@@ -20,8 +20,8 @@
    See: on the left the lower curve is the smoother integrand. In the middle is what a sample is worth, on the right
    what a second is worth; the solid curve of a color against the dashed one is what Metropolis sampling does to it.
 
-   Writes out/smoother.svg, out/smoother.csv (the variation at .4 rad; the cost of a sample in microseconds; the errors
-   after 256 samples, with QUICK=1 after 64, and after the time that bundles take for their last look) and
+   Writes out/smoother.svg, out/smoother.csv (the variation at .4 rad; the cost of a sample in microseconds; the
+   errors after 256 samples, with QUICK=1 after 64, and after the time that bundles take for their last look) and
    out/smoother_curves.csv (what is drawn; x is the apex angle, the number of samples or the time in seconds). */
 
 #define _POSIX_C_SOURCE 200809L
