@@ -1,4 +1,4 @@
-/* light.h - what the tests of chapters 11 to 13 share: small scenes made in code, a render in one call, and the chi
+/* light.h - what the tests of chapters 11 to 14 share: small scenes made in code, a render in one call, and the chi
    square. Include it after metro.h and check.h. */
 
 #ifndef LIGHT_H

@@ -208,7 +208,7 @@ static void cube_factors(metro_visibility visibility, double size, size_t grid, 
     CHECK(metro_moments_mean(&itself) == 0, "a plane sees itself: %g", metro_moments_mean(&itself));
     CHECK_SIGMA(metro_moments_mean(&opposite), 0.19982490, metro_moments_error(&opposite));
     CHECK_SIGMA(metro_moments_mean(&beside), 0.20004378, metro_moments_error(&beside));
-    CHECK(metro_moments_error(&opposite) < 0.02, "error %g", metro_moments_error(&opposite));
+    CHECK(metro_moments_error(&opposite) < 0.03, "error %g", metro_moments_error(&opposite));
     free(radiance);
     free(received);
     metro_patches_free(&patches);
@@ -567,30 +567,40 @@ static void bidirectional_paths(void)
     for (g = 0; g < 2; g++) {
         metro_scene scene = room_scene(g ? 0.5 : 0);
         metro_camera camera = inside_camera();
-        metro_render_options paths = options_make(METRO_BDPT, 32, 4);
-        metro_render render = render_run(&scene, &camera, &paths, check_count(24, 8));
-        metro_image picture = render_image(&render);
+        metro_render_options paths = options_make(METRO_BDPT, 32, 6);
+        metro_render render;
+        metro_image picture;
         metro_render_report seen;
+        paths.shortest = 2;
+        render = render_run(&scene, &camera, &paths, check_count(32, 8));
         metro_render_diagnose(&render, &seen);
+        metro_render_free(&render);
+        paths.shortest = 1;
+        render = render_run(&scene, &camera, &paths, check_count(16, 8));
+        picture = render_image(&render);
         for (shot = 0; shot < 2; shot++) {
-            metro_bundles_options options = bundles_options(4, 0.2, shot ? 60 : 100);
+            metro_bundles_options options = bundles_options(6, 0.2, shot ? 40 : 60);
             metro_bundles bundles;
             metro_bundles_report report;
             metro_image image;
             metro_image_difference difference;
             double error, lamp;
             options.first_shot = shot;
+            options.batches = 32;
             options.visibility = METRO_LINES;
-            bundles = bundles_run(&scene, &camera, &options, check_count(shot ? 192 : 384, 64));
+            bundles = bundles_run(&scene, &camera, &options, check_count(shot ? 512 : 384, 64));
             report = report_of(&bundles);
             memset(&image, 0, sizeof image);
             CHECK(metro_bundles_image(&bundles, &image) == METRO_OK, "image");
             metro_image_error(&image, &picture, &difference);
             error = sqrt(report.mean_error * report.mean_error + seen.mean_error * seen.mean_error);
-            CHECK(fabs(difference.mean - seen.mean) < 0.02 * seen.mean + 5.1 * error, "%g, paths %g +- %g",
-                  difference.mean, seen.mean, error);
+            CHECK(fabs(report.mean - seen.mean) < 0.02 * seen.mean + student_bound(31) * error, "%g, paths %g +- %g",
+                  report.mean, seen.mean, error);
             lamp = difference.mean - report.mean; /* seen directly */
-            CHECK(lamp > 0.02, "the lamp adds %g", lamp);
+            CHECK_CLOSE(lamp, difference.mean_reference - seen.mean, 0.06 * lamp);
+            if (shot)
+                CHECK(report.mean_error < (check_scale() < 0.5 ? 0.2 : 0.03) * report.mean, "error %g of %g",
+                      report.mean_error, report.mean);
             if (shot) CHECK(difference.relative_rmse < 0.25, "the picture is off by %g", difference.relative_rmse);
             metro_image_free(&image);
             metro_bundles_free(&bundles);
@@ -610,7 +620,7 @@ static void walks_agree(void)
     metro_bundles_options options = bundles_options(4, 0.7, 40);
     metro_bundles reference, other;
     metro_bundles_report report;
-    uint64_t walks = check_count(2400, 640);
+    uint64_t walks = check_count(1280, 480);
     options.visibility = METRO_LINES;
     options.batches = 32;
     reference = bundles_run(&scene, &camera, &options, 2 * walks);
@@ -673,7 +683,7 @@ static void weighted_start(void)
     options.visibility = METRO_LINES;
     options.batches = 64;
     options.width = options.height = 8;
-    reference = bundles_run(&scene, &camera, &options, check_count(12800, 3200));
+    reference = bundles_run(&scene, &camera, &options, check_count(6400, 3200));
     options.walk = METRO_WALK_METROPOLIS;
     options.start = METRO_START_WEIGHTED;
     options.candidates = 2;
@@ -737,7 +747,7 @@ static void linear_radiance(void)
         metro_image_free(&image);
         metro_bundles_free(&bundles);
     }
-    CHECK(error[1] < 0.7 * error[0], "constant %g, linear %g", error[0], error[1]);
+    CHECK(error[1] < (check_scale() < 0.5 ? 0.9 : 0.7) * error[0], "constant %g, linear %g", error[0], error[1]);
     metro_image_free(&picture);
     metro_render_free(&render);
     metro_scene_free(&scene);
@@ -796,10 +806,10 @@ static void run_on(void)
     metro_bundles_report a, b;
     options.visibility = METRO_LINES;
     options.batches = 32;
-    right = bundles_run(&scene, &camera, &options, check_count(3000, 1000));
+    right = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     options.walk = METRO_WALK_EVEN;
     options.run_on = 1;
-    wrong = bundles_run(&scene, &camera, &options, check_count(3000, 1000));
+    wrong = bundles_run(&scene, &camera, &options, check_count(1800, 900));
     a = report_of(&right);
     b = report_of(&wrong);
     CHECK(fabs(a.mean - b.mean) > 6 * hypot(a.mean_error, b.mean_error), "%g +- %g, and running on %g +- %g", a.mean,
@@ -829,10 +839,10 @@ static void narrow_lamp(void)
     options.first_shot = 0;
     options.batches = 64;
     options.visibility = METRO_LINES;
-    lines = bundles_run(&scene, &camera, &options, check_count(200000, 50000));
+    lines = bundles_run(&scene, &camera, &options, check_count(60000, 30000));
     agree("lines", &exact, &lines);
     options.visibility = METRO_SWEEP;
-    grid = bundles_run(&scene, &camera, &options, check_count(1600000, 800000));
+    grid = bundles_run(&scene, &camera, &options, check_count(400000, 200000));
     agree("grid", &exact, &grid);
     CHECK(report_of(&grid).mean_error > 0, "no lamp was met");
     metro_bundles_free(&exact);
