@@ -16,8 +16,8 @@
    See: in bundles.svg the spread falls with the grid, and the painter's bias does not. The sweep is exact, and faster
    than the painter. In bundles_grid.svg a coarse grid with many walks beats a fine one with few. In
    bundles_patches.svg the pictures come closer to the truth with more patches, sooner where radiance is linear on
-   each; behind the door light leaks along patches that are lit in part and seen in part. In runon.svg random and even walks go
-   on to improve, and the sequence that runs on stays where it is: it converges to a wrong answer.
+   each; behind the door light leaks along patches that are lit in part and seen in part. In runon.svg random and even
+   walks go on to improve, and the sequence that runs on stays where it is: it converges to a wrong answer.
 
    Writes out/bundles.svg, one panel of it as out/painter.svg, out/bundles_grid.svg, out/bundles_patches.svg and
    out/runon.svg, with out/bundles.csv, out/bundles_grid.csv, out/bundles_patches.csv and out/bundles_runon.csv.
@@ -663,7 +663,7 @@ static double product_of(double (*gram)[PARTS], size_t but)
 static finding find(const room *r, size_t kind, size_t place)
 {
     double gram[PARTS][PARTS], less[PARTS], middle = 0, square = 0;
-    double (*const picture)[PIXELS] = (double (*)[PIXELS])(uintptr_t)r->picture[kind][place];
+    const double (*const picture)[PIXELS] = r->picture[kind][place];
     metro_moments ratio = { 0, 0, 0, 0 };
     finding f;
     size_t k, l, i;

@@ -509,8 +509,8 @@ static void write_claims(const study *s, plot_csv *csv)
 
 static void say(const study *s, char *title, size_t size)
 {
-    const double (*v)[ANGLES] = (const double (*)[ANGLES])(uintptr_t)s->variation[0];
-    const double (*w)[ANGLES] = (const double (*)[ANGLES])(uintptr_t)s->variation[1];
+    const double (*v)[ANGLES] = s->variation[0];
+    const double (*w)[ANGLES] = s->variation[1];
     snprintf(title, size,
              "A mutation of %.1g rad changes the integrand of bundles by %.2g and that of paths by %.2g, behind a "
              "door by %.2g and %.2g; a sample of bundles costs %.0f and %.0f times as much",
