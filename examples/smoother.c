@@ -264,7 +264,7 @@ typedef struct {
     double samples[LOOKS], seconds[LOOKS], block[LOOKS][PIECES];
 } run_slot;
 
-static size_t repeats_of_all(void) { return plot_quick() ? 4 : 16; }
+static size_t repeats_of_all(void) { return plot_quick() ? 4 : 12; }
 
 static size_t looks_of(int method)
 {
