@@ -16,8 +16,8 @@
    See: in bundles.svg the spread falls with the grid, and the painter's bias does not. The sweep is exact, and faster
    than the painter. In bundles_grid.svg a coarse grid with many walks beats a fine one with few. In
    bundles_patches.svg the pictures come closer to the truth with more patches, sooner where radiance is linear on
-   each; behind the door light leaks along patches that the wall cuts in two. In runon.svg random and even walks go
-   on to improve, and the sequence that runs on stays where it is: it converges to a wrong answer.
+   each; behind the door light leaks along patches that are lit in part and seen in part. In runon.svg random and even
+   walks go on to improve, and the sequence that runs on stays where it is: it converges to a wrong answer.
 
    Writes out/bundles.svg, one panel of it as out/painter.svg, out/bundles_grid.svg, out/bundles_patches.svg and
    out/runon.svg, with out/bundles.csv, out/bundles_grid.csv, out/bundles_patches.csv and out/bundles_runon.csv.
@@ -269,7 +269,8 @@ static void transfer_draw(const transfers *t, plot_panel *panel)
 static int save_painter(const transfers *t, const char *title)
 {
     plot_chart chart = plot_chart_make(title, "The Cornell box; each patch sends out a random color. Bars are "
-                                              "standard errors.");
+                                              "standard errors. Dotted: two of them above the bias of the other "
+                                              "three ways.");
     spread_draw(t, &chart.panel[0]);
     return plot_save(&chart, "out/painter.svg");
 }
@@ -534,7 +535,6 @@ typedef struct {
     metro_scene scene;
     size_t shown;                                /* sizes of patches */
     double size[PLACES], patches[PLACES];
-    int hard;                                    /* half of the walks will do: patches cost more than noise */
     double weight[PIXELS];                       /* what a squared difference counts; 0 around the lamp */
     double paths[PARTS][PIXELS];                 /* luminance */
     double picture[KINDS][PLACES][PARTS][PIXELS];
@@ -597,7 +597,7 @@ static metro_result picture_work(uint64_t job, void *slot, void *user)
     options.part = job;
     result = metro_bundles_make(&r->scene, &r->scene.camera, &options, &bundles);
     if (result != METRO_OK) return result;
-    result = metro_bundles_run(&bundles, plot_quick() ? 16 : place_walks[place] >> r->hard, NULL, NULL);
+    result = metro_bundles_run(&bundles, plot_quick() ? 16 : place_walks[place], NULL, NULL);
     if (result == METRO_OK) result = metro_bundles_image(&bundles, &image);
     if (result == METRO_OK) {
         light_luminance(image.value, PIXELS, out->luminance);
@@ -663,7 +663,7 @@ static double product_of(double (*gram)[PARTS], size_t but)
 static finding find(const room *r, size_t kind, size_t place)
 {
     double gram[PARTS][PARTS], less[PARTS], middle = 0, square = 0;
-    double (*const picture)[PIXELS] = (double (*)[PIXELS])(uintptr_t)r->picture[kind][place];
+    const double (*const picture)[PIXELS] = r->picture[kind][place];
     metro_moments ratio = { 0, 0, 0, 0 };
     finding f;
     size_t k, l, i;
@@ -730,16 +730,16 @@ static int show_patches(char *title, size_t size)
     chart.rows = chart.columns = ROOMS;
     chart.width = 1400;
     for (k = 0; k < ROOMS; k++) {
-        r[k].hard = k > 0;
         if (room_run(room_path[k], &r[k]) != 0) return 1;
         room_draw(&r[k], room_title[k], &chart.panel[k], &chart.panel[ROOMS + k], &csv, last[k]);
         metro_scene_free(&r[k].scene);
         progress(0.55 + 0.15 * (double)(k + 1));
     }
     snprintf(title, size,
-             "Smaller patches come closer to the truth, at %.0f by relMSE %.2g, and %.2g if radiance is linear on "
-             "each; at the door light leaks, and the picture is %.3g and %.3g times as bright",
-             r[0].patches[r[0].shown - 1], last[0][0].relmse, last[0][1].relmse, last[1][0].mean, last[1][1].mean);
+             "Smaller patches come closer to the truth: %.0f by relMSE %.2g, and %.2g if radiance is linear on each; "
+             "behind the door the picture is then %.2f (+- %.2f) and %.2f (+- %.2f) times as bright",
+             r[0].patches[r[0].shown - 1], last[0][0].relmse, last[0][1].relmse, last[1][0].mean, last[1][0].mean_se,
+             last[1][1].mean, last[1][1].mean_se);
     chart.title = title;
     return plot_csv_close(&csv) | plot_save(&chart, "out/bundles_patches.svg");
 }

@@ -26,10 +26,10 @@ enum { STEPS = 3, PANELS = STEPS + 1, TRIES = 1200, BRIGHT = 18, SEGMENTS = 2000
 typedef struct {
     metro_scene scene;
     metro_patches patches;
-    unsigned char *seen;             /* [count]: by the eye */
+    unsigned char *seen; /* [count]: by the eye */
     metro_vec3 direction[STEPS];
-    metro_vec3 *sent[PANELS];        /* [count] each: along the bundles, and at last to the eye */
-    metro_vec3 *received;            /* [count] */
+    metro_vec3 *sent[PANELS]; /* [count] each: along the bundles, and at last to the eye */
+    metro_vec3 *received;     /* [count] */
     metro_bundle_balance balance[STEPS];
 } path;
 
@@ -141,9 +141,9 @@ typedef struct {
     FILE *file;
     double scale, left, top;
     double gap;
-    uint32_t *order;   /* [count]: patches that the viewer sees the front of, the farthest first */
+    uint32_t *order; /* [count]: patches that the viewer sees the front of, the farthest first */
     size_t fronts;
-    segment *found;    /* [SEGMENTS] */
+    segment *found; /* [SEGMENTS] */
     size_t count;
 } drawing;
 

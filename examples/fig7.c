@@ -102,8 +102,8 @@ static int draw(exhibit *e, const metro_image *reference, double exposure, size_
 static int write_table(const exhibit *e, size_t patches)
 {
     static const char *const method[2] = { "bundles", "bdpt" };
-    plot_csv csv = plot_csv_open("out/fig7.csv",
-                                 "method,amount,patches,seconds,relative_rmse,relmse,mean,mean_reference");
+    plot_csv csv =
+        plot_csv_open("out/fig7.csv", "method,amount,patches,seconds,relative_rmse,relmse,mean,mean_reference");
     int i;
     for (i = 0; i < 2; i++) {
         plot_csv_text(&csv, method[i]);

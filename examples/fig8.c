@@ -12,13 +12,13 @@
    are many independent runs. Metropolis chains start at a fixed point, one for each of the two: the same in all
    runs, the first of uniform draws that is not dark; the second sheet compares other starts. How bright the picture
    is in the mean is taken from the truth, but not with weighted seeds, which bring it along. What a start costs, up
-   to 16 walks, is not counted.
+   to 16 walks for a chain, is not counted. Both are in favour of Metropolis.
 
    The curves are medians, and half of all runs lie in the bands. Means would say less: now and then several
    directions in a row hit the highlights of the floor and the block, the factors of these multiply, and one walk
    shines hundreds of times as brightly as the picture. A mean over few runs shows whether it has met such a walk.
-   Bias^2 and variance (eq 7.13) are means all the same; those of random and even walks give no more than an order of
-   size.
+   Bias^2 and variance (eq 7.13) are means all the same; those of random and even walks give no more than an order
+   of size.
 
    See: random and even walks go together, and no perturbation comes near; the smaller it is the worse it gets. On
    the second sheet: from fixed points and by small perturbations most of the squared error is bias, and stays so;
@@ -64,14 +64,14 @@ typedef struct {
 typedef struct {
     metro_scene scene;
     size_t visible, runs;
-    size_t *patch;           /* [visible] */
-    double *weight;          /* [visible]: what brings the squares of radiance to shares of the truth's power */
-    double *truth;           /* [3 * visible], times the weight */
-    double brightness;       /* the mean luminance of the truth */
-    double noise;            /* the squared error of the truth, relative */
+    size_t *patch;     /* [visible] */
+    double *weight;    /* [visible]: what brings the squares of radiance to shares of the truth's power */
+    double *truth;     /* [3 * visible], times the weight */
+    double brightness; /* the mean luminance of the truth */
+    double noise;      /* the squared error of the truth, relative */
     uint64_t truth_walks;
-    curve *now;              /* that is measured, and */
-    double *radiance;        /* [LOOKS * runs * 3 * visible]: its runs, times the weight */
+    curve *now;       /* that is measured, and */
+    double *radiance; /* [LOOKS * runs * 3 * visible]: its runs, times the weight */
 } figure;
 
 static void set_curve(curve *c, metro_walk walk, int start, double perturbation, size_t looks)
@@ -357,6 +357,7 @@ static int draw(const figure *f, const curve *curves)
     panel->y_label = "relative error";
     panel->x_log = panel->y_log = 1;
     panel->better = "down and left is better";
+    plot_rule_y(panel, 1, "a black picture");
     for (c = 0; c < MAIN; c++) draw_curve(panel, &curves[c], c);
     return plot_save(&chart, "out/fig8.svg");
 }
@@ -439,10 +440,12 @@ static int draw_starts(const figure *f, const curve *curves)
              "From fixed points bias is %.0f %% of the squared error after %d walks and %.0f %% after %d; "
              "from weighted seeds at most %.0f %%",
              bias_share(fixed, 0), (int)look[0], bias_share(fixed, 4), (int)look[4], most);
-    snprintf(note, sizeof note,
-             "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed). "
-             "Below: the share of bias, signed. %d runs of two chains. The title is for %g rad.",
-             (int)f->runs, fixed->perturbation);
+    snprintf(
+        note, sizeof note,
+        "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed). "
+        "Below: the share of bias, signed. %d runs of two chains. Large steps: one mutation in four, from the fixed "
+        "points. The title is for %g rad.",
+        (int)f->runs, fixed->perturbation);
     chart.title = title;
     chart.note = note;
     chart.rows = 2;
@@ -469,8 +472,8 @@ static void write_verdict(plot_csv *csv, double perturbation, double walks, cons
 static int write_main(const curve *curves)
 {
     static const char *const method[3] = { "random", "even", "metropolis" };
-    plot_csv csv = plot_csv_open("out/fig8.csv",
-                                 "method,perturbation,walks,error,error_se,bias2,bias2_se,variance,variance_se");
+    plot_csv csv =
+        plot_csv_open("out/fig8.csv", "method,perturbation,walks,error,error_se,bias2,bias2_se,variance,variance_se");
     size_t k;
     int c;
     for (c = 0; c < ONE_DIRECTION; c++)
@@ -530,8 +533,7 @@ static void report(const figure *f, const curve *curves)
 {
     size_t k;
     int c;
-    printf("median relative error after so many walks; the truth is off by %.3f\n%-40s",
-           sqrt(f->noise), "");
+    printf("median relative error after so many walks; the truth is off by %.3f\n%-40s", sqrt(f->noise), "");
     for (k = 0; k < curves[RANDOM].looks; k++) printf(" %8d", (int)look[k]);
     printf("\n");
     for (c = 0; c < CURVES; c++) {

@@ -20,8 +20,8 @@
    See: on the left the lower curve is the smoother integrand. In the middle is what a sample is worth, on the right
    what a second is worth; the solid curve of a color against the dashed one is what Metropolis sampling does to it.
 
-   Writes out/smoother.svg, out/smoother.csv (the variation at .4 rad; the cost of a sample in microseconds; the errors
-   after 256 samples, with QUICK=1 after 64, and after the time that bundles take for their last look) and
+   Writes out/smoother.svg, out/smoother.csv (the variation at .4 rad; the cost of a sample in microseconds; the
+   errors after 256 samples, with QUICK=1 after 64, and after the time that bundles take for their last look) and
    out/smoother_curves.csv (what is drawn; x is the apex angle, the number of samples or the time in seconds). */
 
 #define _POSIX_C_SOURCE 200809L
@@ -264,7 +264,7 @@ typedef struct {
     double samples[LOOKS], seconds[LOOKS], block[LOOKS][PIECES];
 } run_slot;
 
-static size_t repeats_of_all(void) { return plot_quick() ? 4 : 16; }
+static size_t repeats_of_all(void) { return plot_quick() ? 4 : 12; }
 
 static size_t looks_of(int method)
 {
@@ -509,8 +509,8 @@ static void write_claims(const study *s, plot_csv *csv)
 
 static void say(const study *s, char *title, size_t size)
 {
-    const double (*v)[ANGLES] = (const double (*)[ANGLES])(uintptr_t)s->variation[0];
-    const double (*w)[ANGLES] = (const double (*)[ANGLES])(uintptr_t)s->variation[1];
+    const double (*v)[ANGLES] = s->variation[0];
+    const double (*w)[ANGLES] = s->variation[1];
     snprintf(title, size,
              "A mutation of %.1g rad changes the integrand of bundles by %.2g and that of paths by %.2g, behind a "
              "door by %.2g and %.2g; a sample of bundles costs %.0f and %.0f times as much",
