@@ -1549,7 +1549,8 @@ typedef struct {
 
 /* What a careful person asks. NaN stands for what a method does not have. */
 typedef struct {
-    double mean, mean_error;  /* the mean luminance of the picture, lamps seen directly left out, and its error */
+    double mean, mean_error;  /* the mean luminance of the patches in the picture, each by its share and even over the
+                                 patch, lamps seen directly left out; and its error */
     double b, b_error;        /* the integral of the importance, and its standard error */
     double acceptance;        /* the share of mutations that were accepted */
     double dark;              /* the share of tentative states of zero importance */
@@ -11575,7 +11576,8 @@ typedef struct {
     float t[4], v[4], w[4], det[4];
 } metroi_lanes;
 
-/* Whether the box of a triangle is met with its margin, and is not behind without; and when it is entered. */
+/* Whether the box of a triangle is met with its margin, and is not behind without; and when it is entered. Nearly all
+   boxes that are met are met without a margin, too, and then it need not be computed. */
 METROI_INLINE int metroi_own_box(const metroi_block *block, int i, const metroi_ray *ray, float *enter)
 {
     float lo[3], hi[3], near_t = ray->t_min, far_t = ray->t, leave = ray->t;
@@ -11591,6 +11593,7 @@ METROI_INLINE int metroi_own_box(const metroi_block *block, int i, const metroi_
         leave = metroi_low(metroi_high(a, b) + ray->spare[k], leave);
     }
     if (!(ray->t_min <= leave)) return 0;
+    if (*enter <= leave) return 1;
     metroi_box_widen(lo, hi);
     for (k = 0; k < 3; k++) { /* eq 10.5 */
         float a = (lo[k] - ray->origin[k]) * ray->reach[k], b = (hi[k] - ray->origin[k]) * ray->reach[k];
@@ -11789,11 +11792,11 @@ METROI_INLINE metroi_v4 metroi_v4_edge(metroi_v4 px, metroi_v4 py, metroi_v4 qx,
     return metroi_v4_sub(metroi_v4_mul(qx, py), metroi_v4_mul(qy, px)); /* eq 10.7 */
 }
 
-/* As metroi_box_widen and metroi_own_box, for four triangles: all ones in the lanes whose box is met. */
-METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ray, const metroi_ray4 *s,
+/* As metroi_box_widen and metroi_own_box, for those of four triangles that are `in`: all ones where it is met. */
+METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ray, const metroi_ray4 *s, metroi_v4 in,
                                           metroi_v4 *enter)
 {
-    metroi_v4 lo[3], hi[3], largest = metroi_v4_all(0), margin, a, b, c;
+    metroi_v4 lo[3], hi[3], largest = metroi_v4_all(0), margin, a, b, c, met;
     metroi_v4 begin = metroi_v4_all(ray->t_min), near_t = begin, far_t = metroi_v4_all(ray->t), leave = far_t;
     int k;
     *enter = begin;
@@ -11802,12 +11805,16 @@ METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ra
         a = metroi_v4_load(p), b = metroi_v4_load(p + 12), c = metroi_v4_load(p + 24);
         lo[k] = metroi_v4_low(metroi_v4_low(a, b), c);
         hi[k] = metroi_v4_high(metroi_v4_high(a, b), c);
-        largest = metroi_v4_high(metroi_v4_high(hi[k], metroi_v4_sub(metroi_v4_all(0), lo[k])), largest);
         a = metroi_v4_mul(metroi_v4_sub(lo[k], s->start[k]), s->reach[k]);
         b = metroi_v4_mul(metroi_v4_sub(hi[k], s->start[k]), s->reach[k]);
         *enter = metroi_v4_high(metroi_v4_low(a, b), *enter);
         leave = metroi_v4_low(metroi_v4_add(metroi_v4_high(a, b), s->spare[k]), leave);
     }
+    in = metroi_v4_and(in, metroi_v4_le(begin, leave));
+    met = metroi_v4_and(in, metroi_v4_le(*enter, leave));
+    if (metroi_v4_mask(met) == metroi_v4_mask(in)) return met;
+    for (k = 0; k < 3; k++)
+        largest = metroi_v4_high(metroi_v4_high(hi[k], metroi_v4_sub(metroi_v4_all(0), lo[k])), largest);
     margin = metroi_v4_mul(largest, metroi_v4_all(METROI_MARGIN));
     for (k = 0; k < 3; k++) { /* eq 10.5 */
         a = metroi_v4_mul(metroi_v4_sub(metroi_v4_sub(lo[k], margin), s->start[k]), s->reach[k]);
@@ -11816,7 +11823,7 @@ METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ra
         b = metroi_v4_mul(metroi_v4_high(a, b), metroi_v4_all(METROI_PAD));
         far_t = metroi_v4_low(metroi_v4_add(b, s->spare[k]), far_t);
     }
-    return metroi_v4_and(metroi_v4_le(begin, leave), metroi_v4_le(near_t, far_t));
+    return metroi_v4_or(met, metroi_v4_and(in, metroi_v4_le(near_t, far_t)));
 }
 
 METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi_ray *ray, const void *spread,
@@ -11842,7 +11849,7 @@ METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi
     t = metroi_v4_div(metroi_v4_mul(T, s->side), det); /* eq 10.8 */
     in = metroi_v4_and(in, metroi_v4_and(metroi_v4_le(n, t), metroi_v4_le(t, f)));
     if (metroi_v4_mask(in) == 0) return 0;
-    in = metroi_v4_and(in, metroi_v4_own_box(row, ray, s, &n));
+    in = metroi_v4_own_box(row, ray, s, in, &n);
     t = metroi_v4_high(t, n); /* eq 10.9 */
     metroi_v4_store(lanes->t, t);
     metroi_v4_store(lanes->v, V);
@@ -15241,8 +15248,8 @@ static void metroi_fragments(metroi_bundle *bundle)
    wrong pairs is the same on the finest grid and with any number of bundles. The sweep above is exact, and
    faster where triangles have many patches.
 
-   [figure: painter.svg | The painter's error does not fall with the grid: form factors by all ways of sections 14.3
-   to 14.6.]
+   [figure: painter.svg | The painter's error does not fall with the grid: what patches receive by all ways of
+   sections 14.3 to 14.6.]
 
    Depths are sorted by their leading 32 bits, eleven at a time, from the last. */
 
