@@ -11802,7 +11802,9 @@ METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ra
     *enter = begin;
     for (k = 0; k < 3; k++) {
         const float *p = row + s->row[k];
-        a = metroi_v4_load(p), b = metroi_v4_load(p + 12), c = metroi_v4_load(p + 24);
+        a = metroi_v4_load(p);
+        b = metroi_v4_load(p + 12);
+        c = metroi_v4_load(p + 24);
         lo[k] = metroi_v4_low(metroi_v4_low(a, b), c);
         hi[k] = metroi_v4_high(metroi_v4_high(a, b), c);
         a = metroi_v4_mul(metroi_v4_sub(lo[k], s->start[k]), s->reach[k]);
