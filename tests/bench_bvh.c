@@ -130,7 +130,11 @@ typedef struct {
 
 enum { SIDE = 512, RAYS = SIDE * SIDE };
 
-static double as_float(double x) { return (double)(float)x; }
+static double as_float(double x)
+{
+    volatile float f = (float)x; /* gcc 12 leaves the conversions of pairs out */
+    return (double)f;
+}
 
 static void ray_set(bench_ray *ray, metro_vec3 o, metro_vec3 d, double t_max)
 {
