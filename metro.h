@@ -1504,7 +1504,8 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
 /* How the directions of a walk are chosen. */
 typedef enum {
     METRO_WALK_RANDOM,     /* each uniform and independent */
-    METRO_WALK_EVEN,       /* the points of an evenly filling sequence with two coordinates for each direction */
+    METRO_WALK_EVEN,       /* the points of an evenly filling sequence with two coordinates for each of the first 16
+                              directions; the rest is random */
     METRO_WALK_METROPOLIS  /* by the chain of R4: importance is the luminance that a walk adds to the picture */
 } metro_walk;
 
@@ -2921,15 +2922,26 @@ METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from
    The result is normalised, so that rounding does not add up over a long chain; an old direction whose squared length
    is off 1 by a per cent is a mistake of the caller and gives NaN. */
 
-static metro_vec3 metroi_direction_turn(metro_vec3 n, double t, metro_rng *rng)
+static inline void metroi_frame(metro_vec3 n, metro_vec3 *across, metro_vec3 *down)
 {
     double sign = n.z < 0 ? -1 : 1, a = -1 / (sign + n.z), b = n.x * n.y * a;
+    *across = metro_vec3_make(1 + sign * n.x * n.x * a, sign * b, -sign * n.x);
+    *down = metro_vec3_make(b, sign + n.y * n.y * a, -n.y);
+}
+
+static inline metro_vec3 metroi_in_frame(metro_vec3 n, double u, double v, double w)
+{
+    metro_vec3 across, down;
+    metroi_frame(n, &across, &down);
+    return metro_vec3_make(u * across.x + v * down.x + w * n.x, u * across.y + v * down.y + w * n.y,
+                           u * across.z + v * down.z + w * n.z);
+}
+
+static metro_vec3 metroi_direction_turn(metro_vec3 n, double t, metro_rng *rng)
+{
     double azimuth = 2 * METROI_PI * metro_rng_uniform(rng), radius = sqrt(t < 2 ? t * (2 - t) : 0);
-    double u = radius * cos(azimuth), v = radius * sin(azimuth), w = 1 - t;
-    if (!(fabs(metro_dot(n, n) - 1) < 0.01)) w = METROI_NAN;
-    return metro_normalize(metro_vec3_make(u * (1 + sign * n.x * n.x * a) + v * b + w * n.x,
-                                           u * sign * b + v * (sign + n.y * n.y * a) + w * n.y,
-                                           -u * sign * n.x - v * n.y + w * n.z));
+    double w = fabs(metro_dot(n, n) - 1) < 0.01 ? 1 - t : METROI_NAN;
+    return metro_normalize(metroi_in_frame(n, radius * cos(azimuth), radius * sin(azimuth), w));
 }
 
 /* t = 1 - cos(theta) between unit vectors: half the squared distance of their tips, which keeps its digits where the
@@ -9251,8 +9263,8 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    and no scaling is needed.
 
    These small functions are asked at every hit, so they are compiled as fast as the rest of the program, and what is
-   METROI_INLINE is inlined wherever it is used: vectors then stay in registers, which makes the walks of chapter 12 a
-   tenth faster. */
+   METROI_INLINE is inlined wherever it is used: vectors then stay in registers, which makes the walks of chapter 12
+   up to a tenth faster. */
 
 #ifdef METROI_COMPILE_FAST
 #pragma GCC pop_options
@@ -9299,10 +9311,11 @@ METROI_INLINE metroi_facet metroi_facet_of(const metro_scene *scene, uint32_t tr
     return facet;
 }
 
-METROI_INLINE metro_vec3 metroi_facet_point(const metroi_facet *facet, double u, double v)
+/* What is linear between three corners, at (1-u-v) p0 + u p1 + v p2. */
+
+METROI_INLINE metro_vec3 metroi_between(const metro_vec3 p[3], double u, double v)
 {
-    return metro_add(metro_scale(facet->corner[0], 1 - u - v),
-                     metro_add(metro_scale(facet->corner[1], u), metro_scale(facet->corner[2], v)));
+    return metro_add(metro_scale(p[0], 1 - u - v), metro_add(metro_scale(p[1], u), metro_scale(p[2], v)));
 }
 
 static double metroi_triangle_area(const metro_scene *scene, uint32_t triangle)
@@ -12126,7 +12139,7 @@ METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, 
    the plane, and going away from it, the ray does not meet it. How flat it leaves does not matter, since a height is
    compared with a height.
 
-   The start is rounded to floats as well, which moves it by up to $e abs(p_k)$ along axis k, and towards the plane by
+   A ray rounds its start to floats (10.6), which moves it by up to $e abs(p_k)$ along axis k, and towards the plane by
    the share $abs(n_k)$ of that. So the height is
 
        h = 16 e L + min(w, 4 e L frac{L}{w}) + 2 e sum_k abs(n_k p_k)                    (10.11)
@@ -12157,8 +12170,7 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
     inward = metro_subtract(metro_scale(metro_add(metro_add(p[0], p[1]), p[2]), 1.0 / 3), point);
     shrink = metroi_smaller(4 * e * (1 + metroi_largest(point) * per_extent), 0.5);
     point = metro_add(point, metro_scale(inward, shrink));
-    point = metro_add(point, metro_scale(n, height));
-    return metro_vec3_make((double)(float)point.x, (double)(float)point.y, (double)(float)point.z);
+    return metro_add(point, metro_scale(n, height));
 }
 
 #undef METROI_ALIGNED
@@ -12257,12 +12269,8 @@ static inline metroi_scatter metroi_surface_scatter(const metroi_surface *surfac
 
 static inline metro_vec3 metroi_direction_at(metro_vec3 axis, double z, double turn)
 {
-    double sign = axis.z < 0 ? -1 : 1, a = -1 / (sign + axis.z), b = axis.x * axis.y * a;
     double radius = sqrt(z < 1 ? (1 - z) * (1 + z) : 0);
-    double u = radius * cos(2 * METROI_PI * turn), v = radius * sin(2 * METROI_PI * turn);
-    return metro_vec3_make(u * (1 + sign * axis.x * axis.x * a) + v * b + z * axis.x,
-                           u * sign * b + v * (sign + axis.y * axis.y * a) + z * axis.y,
-                           -u * sign * axis.x - v * axis.y + z * axis.z);
+    return metroi_in_frame(axis, radius * cos(2 * METROI_PI * turn), radius * sin(2 * METROI_PI * turn), z);
 }
 
 /* A uniform point of a disc lifted onto the hemisphere has the density cos/pi (Malley 1988): its height is the root
@@ -12336,7 +12344,7 @@ static uint32_t metroi_light_choose(const metro_scene *scene, double *u)
 METROI_INLINE metro_vec3 metroi_light_point(const metroi_facet *lamp, double u, double v)
 {
     double root = sqrt(u);
-    return metroi_facet_point(lamp, root * (1 - v), root * v);
+    return metroi_between(lamp->corner, root * (1 - v), root * v);
 }
 
 /* # 11.3 The camera
@@ -12731,7 +12739,7 @@ static int metroi_walk_arrive(const metroi_tracer *tracer, metroi_sample *sample
     if (!(cosine > 0)) return 0;
     to->surface = tracer->surface + scene->material_of[hit.triangle];
     to->normal = facet.normal;
-    to->point = metroi_facet_point(&facet, hit.u, hit.v);
+    to->point = metroi_between(facet.corner, hit.u, hit.v);
     to->origin = metroi_facet_leave(&facet, to->point, facet.normal);
     to->triangle = hit.triangle;
     to->lamp = 0;
@@ -12881,12 +12889,16 @@ static metro_vec3 metroi_join_met(const metroi_tracer *tracer, const metroi_vert
    single precision of t knows the far end to some 1e-7 of the way only, which for small triangles is more than they
    are moved off, so the look ends sixteen such steps before it. */
 
+static int metroi_scene_open(const metro_scene *scene, metro_vec3 from, metro_vec3 to)
+{
+    return !metro_scene_occluded(scene, from, metro_subtract(to, from), 0, 1 - 16.0 / (1 << 23));
+}
+
 static int metroi_join_open(const metroi_tracer *tracer, metroi_sample *sample, const metroi_vertex *y,
                             const metroi_vertex *z)
 {
-    const double end = 1 - 16.0 / (1 << 23);
     sample->rays++;
-    return !metro_scene_occluded(tracer->scene, z->origin, metro_subtract(y->origin, z->origin), 0, end);
+    return metroi_scene_open(tracer->scene, z->origin, y->origin);
 }
 
 /* The end y of a walk from a lamp and the end z of one from the eye, joined by an edge:
@@ -14438,9 +14450,9 @@ static metro_patch metroi_patch_cut(const metroi_facet *facet, uint32_t triangle
     metro_patch patch;
     double step = 1 / (double)n, u = (double)i * step, v = (double)j * step;
     double du = (double)(i + 1) * step, dv = (double)(j + 1) * step;
-    patch.corner[0] = k ? metroi_facet_point(facet, du, dv) : metroi_facet_point(facet, u, v);
-    patch.corner[1] = k ? metroi_facet_point(facet, u, dv) : metroi_facet_point(facet, du, v);
-    patch.corner[2] = k ? metroi_facet_point(facet, du, v) : metroi_facet_point(facet, u, dv);
+    patch.corner[0] = k ? metroi_between(facet->corner, du, dv) : metroi_between(facet->corner, u, v);
+    patch.corner[1] = k ? metroi_between(facet->corner, u, dv) : metroi_between(facet->corner, du, v);
+    patch.corner[2] = k ? metroi_between(facet->corner, du, v) : metroi_between(facet->corner, u, dv);
     patch.normal = facet->normal;
     patch.area = 0.5 * facet->area2 * step * step;
     patch.triangle = triangle;
@@ -14574,11 +14586,8 @@ static metroi_rays metroi_rays_make(const metro_patches *patches, metro_vec3 dir
                                     const double *shift)
 {
     metroi_rays lines;
-    metro_vec3 n = metro_normalize(direction);
-    double sign = n.z < 0 ? -1 : 1, a = -1 / (sign + n.z), b = n.x * n.y * a; /* the frame of section 3.9 */
-    lines.across = metro_vec3_make(1 + sign * n.x * n.x * a, sign * b, -sign * n.x);
-    lines.down = metro_vec3_make(b, sign + n.y * n.y * a, -n.y);
-    lines.along = n;
+    lines.along = metro_normalize(direction);
+    metroi_frame(lines.along, &lines.across, &lines.down); /* section 3.9 */
     lines.middle = patches->middle;
     lines.per_cell = patches->radius > 0 ? 0.5 * (double)grid / patches->radius : 0;
     lines.x = 0.5 * (double)grid + shift[0];
@@ -15467,7 +15476,6 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
     return METRO_OK;
 }
 
-
 /* # 14.7 Walks
 
    A walk is a list of D directions. Along the first one all patches send their emission. Along the k-th they send
@@ -15491,10 +15499,8 @@ typedef struct metroi_batch metroi_batch;
 /* What all walks share. */
 typedef struct {
     const metro_scene *scene;
-    metro_bundles_options own_options;
-    metro_patches own_patches; /* the lists are those of the metro_bundles, which may be moved */
-    const metro_bundles_options *options;
-    const metro_patches *patches;
+    metro_bundles_options options;
+    metro_patches patches;   /* the lists are those of the metro_bundles, which may be moved */
     const double *share;
     metroi_camera camera;
     metroi_surface *surface;
@@ -15574,7 +15580,7 @@ METROI_INLINE double metroi_patch_lit(const metroi_batch *batch, size_t patch, s
 static void metroi_walk_send(metroi_batch *batch, const metro_vec3 *in, metro_vec3 out)
 {
     const metroi_bundles *plan = batch->plan;
-    const metro_patches *patches = plan->patches;
+    const metro_patches *patches = &plan->patches;
     const metroi_bundle *bundle = &batch->bundle;
     double *radiance = bundle->radiance, cell = metroi_bundle_cell(bundle);
     size_t triangle, patch, k, nodes = bundle->nodes;
@@ -15608,9 +15614,9 @@ static void metroi_walk_show(metroi_batch *batch, const metro_vec3 *in, double *
     const metroi_bundle *bundle = &batch->bundle;
     double cell = 2 * METROI_PI * metroi_bundle_cell(bundle);
     size_t i, k, nodes = bundle->nodes;
-    memset(out, 0, 3 * nodes * plan->patches->count * sizeof *out);
-    for (i = 0; i < plan->patches->count; i++) {
-        const metro_patch *patch = &plan->patches->patch[i];
+    memset(out, 0, 3 * nodes * plan->patches.count * sizeof *out);
+    for (i = 0; i < plan->patches.count; i++) {
+        const metro_patch *patch = &plan->patches.patch[i];
         const metroi_surface *surface = metroi_surface_of(plan, patch->triangle);
         metro_vec3 eye = plan->to_eye[i], f = surface->diffuse, source = metro_vec3_make(0, 0, 0);
         double scale = in != NULL ? cell / patch->area : 0; /* eq 14.4 */
@@ -15642,8 +15648,7 @@ static void metroi_shoot_patch(metroi_batch *batch, size_t i, metro_rng *rng)
 {
     const metroi_bundles *plan = batch->plan;
     const metro_scene *scene = plan->scene;
-    const metro_patch *patch = &plan->patches->patch[i];
-    const double end = 1 - 16.0 / (1 << 23); /* as in section 12.5 */
+    const metro_patch *patch = &plan->patches.patch[i];
     double u = metro_rng_uniform(rng), v = metro_rng_uniform(rng), root, distance2, cos_p, cos_y, h;
     double choice = metro_rng_uniform(rng), across = metro_rng_uniform(rng);
     uint32_t lamp = metroi_light_choose(scene, &choice);
@@ -15654,8 +15659,7 @@ static void metroi_shoot_patch(metroi_batch *batch, size_t i, metro_rng *rng)
     batch->lit_from[i] = patch->normal;
     if (metroi_surface_of(plan, patch->triangle)->black || lamp == patch->triangle) return;
     root = sqrt(u);
-    p = metro_add(metro_scale(patch->corner[0], 1 - root),
-                  metro_add(metro_scale(patch->corner[1], root * (1 - v)), metro_scale(patch->corner[2], root * v)));
+    p = metroi_between(patch->corner, root * (1 - v), root * v);
     d = metro_subtract(y, p);
     distance2 = metro_dot(d, d);
     if (!(distance2 > 0)) return;
@@ -15666,7 +15670,7 @@ static void metroi_shoot_patch(metroi_batch *batch, size_t i, metro_rng *rng)
     from = metroi_facet_leave(&plan->facet[patch->triangle], p, d);
     y = metroi_facet_leave(facet, y, metro_scale(d, -1));
     batch->rays++;
-    if (metro_scene_occluded(scene, from, metro_subtract(y, from), 0, end)) return;
+    if (!metroi_scene_open(scene, from, y)) return;
     h = cos_p * cos_y / (distance2 * metroi_light_density(scene, glow)); /* eq 14.9 */
     batch->lit_from[i] = d;
     if (batch->lit_share != NULL) { /* eq 14.5 for a single point, whose density is 1/A */
@@ -15688,7 +15692,7 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
     size_t d = plan->directions, k, i;
     const double *shift = z + 3 * d;
     metro_vec3 in = metro_vec3_make(0, 0, 1), direction;
-    for (i = 0; batch->lit != NULL && i < plan->patches->count; i++) metroi_shoot_patch(batch, i, shots);
+    for (i = 0; batch->lit != NULL && i < plan->patches.count; i++) metroi_shoot_patch(batch, i, shots);
     for (k = 0; k < d; k++) {
         direction = metro_vec3_make(z[3 * k], z[3 * k + 1], z[3 * k + 2]);
         metroi_walk_send(batch, k > 0 ? &in : NULL, direction);
@@ -15735,8 +15739,8 @@ static double metroi_walk_coordinate(const metroi_bundles *plan, uint64_t round,
 {
     unsigned dimension = 2 * (unsigned)k + c;
     double x = metro_rng_uniform(rng);
-    if (plan->options->walk != METRO_WALK_EVEN) return x;
-    if (!plan->options->run_on) return dimension < 32 ? metro_sobol(round, dimension, scramble) : x;
+    if (plan->options.walk != METRO_WALK_EVEN) return x;
+    if (!plan->options.run_on) return dimension < 32 ? metro_sobol(round, dimension, scramble) : x;
     x = metroi_halton(round * plan->directions + k, c == 0 ? 2 : 3) + metro_sobol(0, c, scramble);
     return x < 1 ? x : x - 1;
 }
@@ -15756,13 +15760,13 @@ static void metroi_walk_choose(metroi_batch *batch, uint64_t round, uint64_t scr
 static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
 {
     metroi_bundles *plan = (metroi_bundles *)user;
-    size_t index = (size_t)(job % plan->options->batches), i;
+    size_t index = (size_t)(job % plan->options.batches), i;
     metroi_batch *batch = &plan->batch[index];
     metro_rng rng = metro_rng_make(plan->key, job);
     (void)slot;
-    metroi_walk_choose(batch, job / plan->options->batches, metroi_mix(plan->key + index), &rng);
+    metroi_walk_choose(batch, job / plan->options.batches, metroi_mix(plan->key + index), &rng);
     metroi_bundles_walk(batch, batch->state, &rng, batch->out);
-    for (i = 0; i < 3 * batch->bundle.nodes * plan->patches->count; i++) batch->sum[i] += batch->out[i];
+    for (i = 0; i < 3 * batch->bundle.nodes * plan->patches.count; i++) batch->sum[i] += batch->out[i];
     return METRO_OK;
 }
 
@@ -15799,10 +15803,10 @@ static double metroi_walk_importance(const double *z, void *sample, void *user)
     metroi_batch *batch = (metroi_batch *)user;
     const metroi_bundles *plan = batch->plan;
     double *out = (double *)sample, importance = 0;
-    size_t count = plan->patches->count, i;
+    size_t count = plan->patches.count, i;
     metro_rng shots;
     uint64_t number = 0;
-    if (plan->options->first_shot) memcpy(&number, z + 5 * plan->directions, sizeof number);
+    if (plan->options.first_shot) memcpy(&number, z + 5 * plan->directions, sizeof number);
     shots = metro_rng_make(plan->key, number);
     metroi_bundles_walk(batch, z, &shots, out);
     for (i = 0; i < count; i++)
@@ -15816,7 +15820,7 @@ static void metroi_walk_record(const void *sample, double weight, void *user)
 {
     metroi_batch *batch = (metroi_batch *)user;
     const double *out = (const double *)sample;
-    size_t count = 3 * batch->bundle.nodes * batch->plan->patches->count, i;
+    size_t count = 3 * batch->bundle.nodes * batch->plan->patches.count, i;
     weight *= batch->scale / out[count]; /* eq 4.1 */
     for (i = 0; i < count; i++) batch->sum[i] += weight * out[i];
 }
@@ -15826,9 +15830,9 @@ static void metroi_walk_record(const void *sample, double weight, void *user)
 static double metroi_walk_propose_one(const double *from, double *to, metro_rng *rng, void *user)
 {
     const metroi_bundles *plan = ((const metroi_batch *)user)->plan;
-    size_t d = plan->directions, doubles = 5 * d + (plan->options->first_shot ? 1u : 0u), k, i;
+    size_t d = plan->directions, doubles = 5 * d + (plan->options.first_shot ? 1u : 0u), k, i;
     memcpy(to, from, doubles * sizeof *to);
-    if (plan->options->first_shot) to[5 * d] = metro_rng_uniform(rng);
+    if (plan->options.first_shot) to[5 * d] = metro_rng_uniform(rng);
     if (d == 0) return 1;
     k = (size_t)metro_rng_below(rng, d);
     metroi_direction_perturb(&plan->axis[k].kernel, from + 3 * k, to + 3 * k, rng);
@@ -15840,8 +15844,8 @@ static double metroi_walk_propose_one(const double *from, double *to, metro_rng 
 static metro_result metroi_walk_axes(metroi_bundles *plan)
 {
     size_t d = plan->directions, i;
-    double half_angle = 0.5 * plan->options->perturbation, moved = half_angle * (double)plan->options->grid;
-    plan->axis_count = 3 * d + (plan->options->first_shot ? 1u : 0u);
+    double half_angle = 0.5 * plan->options.perturbation, moved = half_angle * (double)plan->options.grid;
+    plan->axis_count = 3 * d + (plan->options.first_shot ? 1u : 0u);
     plan->axis = (metro_axis *)metroi_zeros(plan->axis_count, sizeof *plan->axis);
     if (plan->axis == NULL) return METRO_ERROR_MEMORY;
     for (i = 0; i < d; i++) plan->axis[i] = metroi_axis_make(METRO_DIRECTION, METRO_UNIFORM, half_angle, 0);
@@ -15858,12 +15862,12 @@ static metro_result metroi_walk_chain(metroi_batch *batch, uint64_t index)
     memset(&target, 0, sizeof target);
     target.axes = plan->axis;
     target.axis_count = plan->axis_count;
-    target.sample_size = (3 * batch->bundle.nodes * plan->patches->count + 1) * sizeof(double);
+    target.sample_size = (3 * batch->bundle.nodes * plan->patches.count + 1) * sizeof(double);
     target.importance = metroi_walk_importance;
     target.record = metroi_walk_record;
-    target.propose = plan->options->one_direction ? metroi_walk_propose_one : NULL;
+    target.propose = plan->options.one_direction ? metroi_walk_propose_one : NULL;
     target.user = batch;
-    options.large_step = plan->options->large_step;
+    options.large_step = plan->options.large_step;
     options.expected_values = 1;
     return metro_chain_make(&target, &options, metro_rng_make(plan->key, index), &batch->chain);
 }
@@ -15872,7 +15876,7 @@ static metro_result metroi_walk_chain(metroi_batch *batch, uint64_t index)
 
 static metro_result metroi_walk_start_point(metroi_batch *batch, uint64_t index)
 {
-    const metro_bundles_options *options = batch->plan->options;
+    const metro_bundles_options *options = &batch->plan->options;
     metro_rng rng = metro_rng_make(options->start_seed, index);
     metro_result result = METRO_ERROR_DARK_SEED;
     size_t tries;
@@ -15888,7 +15892,7 @@ static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
 {
     metroi_bundles *plan = (metroi_bundles *)user;
     metroi_batch *batch = &plan->batch[job];
-    const metro_bundles_options *options = plan->options;
+    const metro_bundles_options *options = &plan->options;
     int tries = options->start == METRO_START_WEIGHTED ? 1 : 64;
     metro_result result = METRO_ERROR_NO_IMPORTANCE;
     (void)slot;
@@ -15906,12 +15910,12 @@ static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
 static metro_result metroi_walk_step(uint64_t job, void *slot, void *user)
 {
     metroi_bundles *plan = (metroi_bundles *)user;
-    metroi_batch *batch = &plan->batch[job % plan->options->batches];
-    uint64_t round = job / plan->options->batches;
+    metroi_batch *batch = &plan->batch[job % plan->options.batches];
+    uint64_t round = job / plan->options.batches;
     (void)slot;
     if (!batch->alive) return METRO_OK;
     metro_chain_run(&batch->chain, 1);
-    if (!(plan->options->large_step > 0) && round % 16 == 15) metro_chain_survey(&batch->chain, 1);
+    if (!(plan->options.large_step > 0) && round % 16 == 15) metro_chain_survey(&batch->chain, 1);
     return METRO_OK;
 }
 
@@ -15931,25 +15935,25 @@ static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y
     metro_vec3 direction = metroi_camera_direction(&plan->camera, x, y);
     if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, hit)
         || !(metro_dot(plan->facet[hit->triangle].normal, direction) < 0))
-        return plan->patches->count;
-    return metro_patches_at(plan->patches, hit->triangle, hit->u, hit->v);
+        return plan->patches.count;
+    return metro_patches_at(&plan->patches, hit->triangle, hit->u, hit->v);
 }
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
-    size_t width = 2 * plan->options->width, height = 2 * plan->options->height, x, y;
+    size_t width = 2 * plan->options.width, height = 2 * plan->options.height, x, y;
     metro_hit hit;
     for (y = 0; y < height; y++)
         for (x = 0; x < width; x++) {
             size_t patch = metroi_bundles_look(plan, 0.5 * ((double)x + 0.5), 0.5 * ((double)y + 0.5), &hit);
-            if (patch < plan->patches->count) share[patch] += 1 / ((double)width * (double)height);
+            if (patch < plan->patches.count) share[patch] += 1 / ((double)width * (double)height);
         }
 }
 
 static void metroi_bundles_free(metroi_bundles *plan)
 {
     size_t i;
-    for (i = 0; plan->batch != NULL && i < plan->options->batches; i++) {
+    for (i = 0; plan->batch != NULL && i < plan->options.batches; i++) {
         metroi_batch *batch = &plan->batch[i];
         metro_chain_free(&batch->chain);
         metroi_bundle_free(&batch->bundle);
@@ -16033,12 +16037,12 @@ static metro_result metroi_bundles_cut(metro_bundles *bundles)
 static metro_result metroi_batch_make(metroi_bundles *plan, size_t index)
 {
     metroi_batch *batch = &plan->batch[index];
-    const metro_bundles_options *options = plan->options;
-    size_t count = plan->patches->count + 1;
+    const metro_bundles_options *options = &plan->options;
+    size_t count = plan->patches.count + 1;
     metro_result result;
     batch->plan = plan;
     batch->scale = 1;
-    result = metroi_bundle_make(plan->patches, options->grid, options->visibility, options->linear, &batch->bundle);
+    result = metroi_bundle_make(&plan->patches, options->grid, options->visibility, options->linear, &batch->bundle);
     if (result != METRO_OK) return result;
     batch->out = (double *)metroi_zeros(count, 3 * batch->bundle.nodes * sizeof(double));
     batch->sum = (double *)metroi_zeros(count, 3 * batch->bundle.nodes * sizeof(double));
@@ -16061,8 +16065,8 @@ static metro_result metroi_batch_make(metroi_bundles *plan, size_t index)
 static void metroi_bundles_aim(const metroi_bundles *plan)
 {
     size_t i;
-    for (i = 0; i < plan->patches->count; i++) {
-        const metro_patch *patch = &plan->patches->patch[i];
+    for (i = 0; i < plan->patches.count; i++) {
+        const metro_patch *patch = &plan->patches.patch[i];
         metro_vec3 middle = metro_add(metro_add(patch->corner[0], patch->corner[1]), patch->corner[2]);
         metro_vec3 eye = metro_normalize(metro_subtract(plan->camera.eye, metro_scale(middle, 1.0 / 3)));
         if (metro_dot(eye, patch->normal) > 0) plan->to_eye[i] = eye;
@@ -16076,27 +16080,25 @@ static metro_result metroi_bundles_fill(metroi_bundles *plan, const metro_bundle
     metro_result result = METRO_OK;
     size_t i;
     plan->scene = scene;
-    plan->own_options = bundles->options;
-    plan->own_patches = bundles->patches;
-    plan->options = &plan->own_options;
-    plan->patches = &plan->own_patches;
+    plan->options = bundles->options;
+    plan->patches = bundles->patches;
     plan->share = bundles->share;
     plan->camera = metroi_camera_make(camera, bundles->options.width, bundles->options.height);
     plan->key = metroi_mix(bundles->options.seed ^ metroi_mix(bundles->options.part));
     plan->directions = (size_t)bundles->options.depth - (bundles->options.first_shot ? 2 : 1);
     plan->surface = (metroi_surface *)metroi_zeros(scene->material_count + 1, sizeof *plan->surface);
     plan->facet = (metroi_facet *)metroi_zeros(scene->triangle_count, sizeof *plan->facet);
-    plan->to_eye = (metro_vec3 *)metroi_zeros(plan->patches->count + 1, sizeof *plan->to_eye);
+    plan->to_eye = (metro_vec3 *)metroi_zeros(plan->patches.count + 1, sizeof *plan->to_eye);
     if (plan->surface == NULL || plan->facet == NULL || plan->to_eye == NULL) return METRO_ERROR_MEMORY;
     for (i = 0; i <= scene->material_count; i++)
         plan->surface[i] = metroi_surface_make(metroi_scene_material(scene, (uint32_t)i));
     for (i = 0; i < scene->triangle_count; i++) plan->facet[i] = metroi_facet_of(scene, (uint32_t)i);
     metroi_bundles_aim(plan);
-    if (plan->options->walk == METRO_WALK_METROPOLIS) result = metroi_walk_axes(plan);
+    if (plan->options.walk == METRO_WALK_METROPOLIS) result = metroi_walk_axes(plan);
     if (result != METRO_OK) return result;
-    plan->batch = (metroi_batch *)metroi_zeros(plan->options->batches, sizeof *plan->batch);
+    plan->batch = (metroi_batch *)metroi_zeros(plan->options.batches, sizeof *plan->batch);
     if (plan->batch == NULL) return METRO_ERROR_MEMORY;
-    for (i = 0; result == METRO_OK && i < plan->options->batches; i++) result = metroi_batch_make(plan, i);
+    for (i = 0; result == METRO_OK && i < plan->options.batches; i++) result = metroi_batch_make(plan, i);
     if (result == METRO_OK) metroi_bundles_shares(plan, bundles->share);
     return result;
 }
@@ -16132,9 +16134,9 @@ static int metroi_bundles_stop(uint64_t rounds, void *user)
     size_t i;
     (void)rounds;
     plan->rounds++;
-    shown->walks += plan->options->batches;
+    shown->walks += plan->options.batches;
     shown->bundles = shown->rays = 0;
-    for (i = 0; i < plan->options->batches; i++) {
+    for (i = 0; i < plan->options.batches; i++) {
         shown->bundles += plan->batch[i].bundles;
         shown->rays += plan->batch[i].rays;
     }
@@ -16147,12 +16149,12 @@ static metro_result metroi_bundles_start(metroi_bundles *plan)
     metro_result result;
     size_t i;
     memset(&rounds, 0, sizeof rounds);
-    rounds.jobs = plan->options->batches;
-    rounds.threads = plan->options->threads;
+    rounds.jobs = plan->options.batches;
+    rounds.threads = plan->options.threads;
     rounds.work = metroi_walk_start;
     result = metro_rounds_run(&rounds, plan);
     if (result != METRO_OK) return result;
-    for (plan->alive = i = 0; i < plan->options->batches; i++) plan->alive += plan->batch[i].alive ? 1u : 0u;
+    for (plan->alive = i = 0; i < plan->options.batches; i++) plan->alive += plan->batch[i].alive ? 1u : 0u;
     return plan->alive > 0 ? METRO_OK : METRO_ERROR_NO_IMPORTANCE;
 }
 
@@ -16164,7 +16166,7 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
     metro_result result;
     if (plan == NULL) return METRO_ERROR_ARGUMENT;
     if (walks == 0) return METRO_OK;
-    if (plan->options->walk == METRO_WALK_METROPOLIS && plan->alive == 0) {
+    if (plan->options.walk == METRO_WALK_METROPOLIS && plan->alive == 0) {
         result = metroi_bundles_start(plan);
         if (result != METRO_OK) return result;
     }
@@ -16172,11 +16174,11 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
     plan->stop = stop;
     plan->user = user;
     memset(&rounds, 0, sizeof rounds);
-    rounds.jobs = plan->options->batches;
+    rounds.jobs = plan->options.batches;
     rounds.rounds = walks / rounds.jobs + (walks % rounds.jobs != 0);
     rounds.first_round = plan->rounds;
-    rounds.threads = plan->options->threads;
-    rounds.work = plan->options->walk == METRO_WALK_METROPOLIS ? metroi_walk_step : metroi_bundles_work;
+    rounds.threads = plan->options.threads;
+    rounds.work = plan->options.walk == METRO_WALK_METROPOLIS ? metroi_walk_step : metroi_bundles_work;
     rounds.stop = metroi_bundles_stop;
     return metro_rounds_run(&rounds, plan);
 }
@@ -16189,7 +16191,7 @@ static double metroi_bundles_b(const metroi_bundles *plan, double *error)
     metro_moments moments;
     size_t i;
     memset(&moments, 0, sizeof moments);
-    for (i = 0; i < plan->options->batches; i++)
+    for (i = 0; i < plan->options.batches; i++)
         metroi_moments_join(&moments, &plan->batch[i].chain.normalisation);
     *error = metro_moments_error(&moments);
     return metro_moments_mean(&moments);
@@ -16208,7 +16210,7 @@ static metroi_bundles_scale metroi_bundles_scale_of(const metroi_bundles *plan)
     scale.scale = 1 / (double)plan->rounds;
     scale.b_share = 0;
     scale.all = 1;
-    if (plan->options->walk != METRO_WALK_METROPOLIS || plan->options->start == METRO_START_WEIGHTED) return scale;
+    if (plan->options.walk != METRO_WALK_METROPOLIS || plan->options.start == METRO_START_WEIGHTED) return scale;
     b = metroi_bundles_b(plan, &error);
     scale.scale *= b;
     scale.b_share = error / b;
@@ -16226,7 +16228,7 @@ static double metroi_bundles_number(const metroi_bundles *plan, const metroi_bun
     double mean, spread;
     size_t i, k;
     memset(&moments, 0, sizeof moments);
-    for (i = 0; i < plan->options->batches; i++) {
+    for (i = 0; i < plan->options.batches; i++) {
         double value = 0;
         for (k = 0; k < count; k++) value += plan->batch[i].sum[index + 3 * k];
         if (scale->all || plan->batch[i].alive) metro_moments_add(&moments, scale->scale * value / (double)count);
@@ -16258,7 +16260,7 @@ METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metr
 {
     const metroi_bundles *plan = (const metroi_bundles *)bundles->state;
     if (plan == NULL || plan->rounds == 0 || radiance == NULL) return METRO_ERROR_ARGUMENT;
-    metroi_bundles_numbers(plan, plan->patches->count, plan->options->linear ? 3 : 1, radiance, error);
+    metroi_bundles_numbers(plan, plan->patches.count, plan->options.linear ? 3 : 1, radiance, error);
     return METRO_OK;
 }
 
@@ -16278,13 +16280,13 @@ static metro_vec3 metroi_gather_at(const metroi_gather *gather, size_t patch, co
 {
     const metroi_bundles *plan = gather->plan;
     const metro_vec3 *value = gather->radiance + 3 * patch;
-    int32_t n = (int32_t)plan->patches->cuts[hit->triangle], i, j, k;
+    int32_t n = (int32_t)plan->patches.cuts[hit->triangle], i, j, k;
     double u = hit->u * (double)n, v = hit->v * (double)n;
-    if (!plan->options->linear) return gather->radiance[patch];
+    if (!plan->options.linear) return gather->radiance[patch];
     metroi_patch_place(u, v, n, &i, &j, &k);
     u = k ? (double)(i + 1) - u : u - (double)i; /* the corners of section 14.1 */
     v = k ? (double)(j + 1) - v : v - (double)j;
-    return metro_add(metro_scale(value[0], 1 - u - v), metro_add(metro_scale(value[1], u), metro_scale(value[2], v)));
+    return metroi_between(value, u, v);
 }
 
 static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
@@ -16300,7 +16302,7 @@ static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
             metro_hit hit;
             size_t patch = metroi_bundles_look(plan, (double)x + (i + 0.5) / side, (double)y + (j + 0.5) / side,
                                                &hit);
-            if (patch >= plan->patches->count) continue;
+            if (patch >= plan->patches.count) continue;
             seen = metro_add(metroi_gather_at(gather, patch, &hit), metroi_surface_of(plan, hit.triangle)->emission);
             pixel[0] += share * seen.x;
             pixel[1] += share * seen.y;
@@ -16328,10 +16330,10 @@ METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_i
     metro_result result;
     size_t values;
     if (plan == NULL || plan->rounds == 0 || image == NULL) return METRO_ERROR_ARGUMENT;
-    values = plan->patches->count * (plan->options->linear ? 3 : 1);
+    values = plan->patches.count * (plan->options.linear ? 3 : 1);
     radiance = (metro_vec3 *)metroi_zeros(values + 1, sizeof *radiance);
     if (radiance == NULL) return METRO_ERROR_MEMORY;
-    result = metro_image_make(plan->options->width, plan->options->height, 3, &made);
+    result = metro_image_make(plan->options.width, plan->options.height, 3, &made);
     if (result == METRO_OK) {
         metroi_bundles_numbers(plan, values, 1, radiance, NULL);
         gather.plan = plan;
@@ -16339,7 +16341,7 @@ METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_i
         gather.image = &made;
         memset(&rounds, 0, sizeof rounds);
         rounds.jobs = METROI_GATHER_JOBS;
-        rounds.threads = plan->options->threads;
+        rounds.threads = plan->options.threads;
         rounds.work = metroi_gather_work;
         result = metro_rounds_run(&rounds, &gather);
         if (result == METRO_OK) *image = made;
@@ -16349,7 +16351,7 @@ METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_i
     return result;
 }
 
-/* The mean luminance of the picture, batch by batch. */
+/* The mean luminance of the patches in the picture, batch by batch. */
 
 static double metroi_bundles_mean(const metroi_bundles *plan, double *error)
 {
@@ -16358,11 +16360,11 @@ static double metroi_bundles_mean(const metroi_bundles *plan, double *error)
     double mean, spread;
     size_t b, i;
     memset(&moments, 0, sizeof moments);
-    for (b = 0; b < plan->options->batches; b++) {
+    for (b = 0; b < plan->options.batches; b++) {
         const double *sum = plan->batch[b].sum;
         double luminance = 0;
         if (!scale.all && !plan->batch[b].alive) continue;
-        for (i = 0; i < plan->patches->count; i++)
+        for (i = 0; i < plan->patches.count; i++)
             luminance += plan->share[i] * metroi_patch_luminance(sum, plan->batch[b].bundle.nodes, i);
         metro_moments_add(&moments, scale.scale * luminance);
     }
@@ -16382,9 +16384,9 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
     report->acceptance = report->dark = report->squared_jump = METROI_NAN;
     if (plan == NULL || plan->rounds == 0) return;
     report->mean = metroi_bundles_mean(plan, &report->mean_error);
-    if (plan->options->walk != METRO_WALK_METROPOLIS) return;
+    if (plan->options.walk != METRO_WALK_METROPOLIS) return;
     report->b = metroi_bundles_b(plan, &report->b_error);
-    for (i = 0; i < plan->options->batches; i++) {
+    for (i = 0; i < plan->options.batches; i++) {
         const metro_chain_counts *counts = &plan->batch[i].chain.counts;
         if (!plan->batch[i].alive) continue;
         steps += (double)counts->steps;

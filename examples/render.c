@@ -321,7 +321,7 @@ static int read_request(int argc, char **argv, request *r)
 typedef struct {
     uint64_t rounds, samples, rays; /* of bundles: walks for both */
     double perturbation, large_step;
-    size_t width, height, threads, chains;
+    size_t threads, chains;
     int depth;
 } outcome;
 
@@ -531,11 +531,12 @@ static double seconds_now(void)
 static double progress(const work *w, uint64_t rounds)
 {
     const answer *a = w->asked.answers;
-    uint64_t asked = is_bundle(w) ? DEFAULT_WALKS : DEFAULT_ROUNDS;
-    int id;
+    uint64_t asked = a[SPP].given      ? a[SPP].whole[0]
+                     : a[ROUNDS].given ? a[ROUNDS].whole[0]
+                     : a[WALKS].given  ? a[WALKS].whole[0]
+                     : is_bundle(w)    ? (uint64_t)DEFAULT_WALKS
+                                       : (uint64_t)DEFAULT_ROUNDS;
     if (a[SECONDS].given) return (seconds_now() - w->started) / a[SECONDS].real[0];
-    for (id = SPP; id <= WALKS; id++)
-        if (a[id].given && (id == SPP || id == ROUNDS || id == WALKS)) asked = a[id].whole[0];
     return (double)rounds / (double)asked;
 }
 
@@ -564,16 +565,8 @@ static metro_result run_render(work *w, metro_result *ended)
     if (result != METRO_OK) return result;
     *ended = metro_render_run(r, UINT64_MAX, stop_render, w);
     w->seconds = seconds_now() - w->started;
-    w->made.rounds = r->rounds;
-    w->made.samples = r->samples;
-    w->made.rays = r->rays;
-    w->made.perturbation = r->options.perturbation;
-    w->made.large_step = r->options.large_step;
-    w->made.width = r->options.width;
-    w->made.height = r->options.height;
-    w->made.threads = r->options.threads;
-    w->made.chains = r->options.chains;
-    w->made.depth = r->options.depth;
+    w->made = (outcome){ r->rounds, r->samples, r->rays, r->options.perturbation, r->options.large_step,
+                         r->options.threads, r->options.chains, r->options.depth };
     if (r->rounds == 0) return METRO_OK;
     metro_render_diagnose(r, &w->report);
     return metro_render_image(r, &w->image);
@@ -625,15 +618,8 @@ static metro_result run_bundles(work *w, metro_result *ended)
     if (result != METRO_OK) return result;
     *ended = metro_bundles_run(b, UINT64_MAX, stop_bundles, w);
     w->seconds = seconds_now() - w->started;
-    w->made.rounds = w->made.samples = b->walks;
-    w->made.rays = b->rays;
-    w->made.perturbation = b->options.perturbation;
-    w->made.large_step = b->options.large_step;
-    w->made.width = b->options.width;
-    w->made.height = b->options.height;
-    w->made.threads = b->options.threads;
-    w->made.chains = b->options.batches;
-    w->made.depth = b->options.depth;
+    w->made = (outcome){ b->walks, b->walks, b->rays, b->options.perturbation, b->options.large_step,
+                         b->options.threads, b->options.batches, b->options.depth };
     if (b->walks == 0) return METRO_OK;
     report_bundles(w);
     return metro_bundles_image(b, &w->image);
@@ -706,8 +692,8 @@ static void fill_row(const work *w, plot_csv *csv)
     plot_csv_text(csv, w->asked.scene);
     plot_csv_text(csv, method_name[w->asked.answers[METHOD].whole[0]]);
     plot_csv_text(csv, walks ? start_name[w->options.start] : "");
-    plot_csv_number(csv, (double)m->width);
-    plot_csv_number(csv, (double)m->height);
+    plot_csv_number(csv, (double)w->image.width);
+    plot_csv_number(csv, (double)w->image.height);
     plot_csv_number(csv, (double)m->depth);
     plot_csv_text(csv, seed);
     plot_csv_number(csv, (double)w->options.part);
@@ -777,9 +763,9 @@ static void say_run(const work *w)
            (unsigned long)w->scene.light_count);
     say_camera(w);
     printf("%s, %lu x %lu pixels, depth %d, seed %llu: %llu %s in %.2f s on %lu threads\n",
-           method_name[w->asked.answers[METHOD].whole[0]], (unsigned long)m->width, (unsigned long)m->height,
-           m->depth, (unsigned long long)w->options.seed, (unsigned long long)m->rounds,
-           is_bundle(w) ? "walks" : "rounds", w->seconds, (unsigned long)m->threads);
+           method_name[w->asked.answers[METHOD].whole[0]], (unsigned long)w->image.width,
+           (unsigned long)w->image.height, m->depth, (unsigned long long)w->options.seed,
+           (unsigned long long)m->rounds, is_bundle(w) ? "walks" : "rounds", w->seconds, (unsigned long)m->threads);
     if (is_bundle(w))
         printf("%lu patches, %lu x %lu lines in a bundle, %llu bundles (%.3g a second)\n",
                (unsigned long)w->bundles.patches.count, (unsigned long)w->bundles.options.grid,

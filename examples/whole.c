@@ -10,8 +10,9 @@
    Ray bundles have a second error, which no time removes: the picture is made of patches. The dashed rule is that
    error alone, where it can be told from the noise.
 
-   See: down and left is better. In even light both integrals do well without Metropolis, bundles at once and paths
-   later, when the patches hold the bundles up; behind the door Metropolis sampling of paths has its place. For
+   See: down and left is better. In even light bundles with even directions and path tracing take turns, until the
+   patches hold the bundles up. Behind the door bidirectional paths and Metropolis sampling in primary space share the
+   front, by this measure; `costs` weighs dark pixels as much as bright ones, and there primary space leads. For
    bundles the first shot and even directions help, and Metropolis does not: a walk lights all of the scene, so its
    importance says little about any part of it.
 
