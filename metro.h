@@ -12139,8 +12139,8 @@ METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, 
    the plane, and going away from it, the ray does not meet it. How flat it leaves does not matter, since a height is
    compared with a height.
 
-   A ray rounds its start to floats (10.6), which moves it by up to $e abs(p_k)$ along axis k, and towards the plane by
-   the share $abs(n_k)$ of that. So the height is
+   A ray rounds its start to floats (10.6), which moves it by up to $e abs(p_k)$ along axis k, and towards the plane
+   by the share $abs(n_k)$ of that. So the height is
 
        h = 16 e L + min(w, 4 e L frac{L}{w}) + 2 e sum_k abs(n_k p_k)                    (10.11)
 
