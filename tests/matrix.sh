@@ -5,10 +5,11 @@ set -u
 work=build/matrix
 rm -rf "$work"
 mkdir -p "$work"
-failures=0
 skipped=""
-clock=$(date +%s)
-tests=$(cd tests && ls test_*.c | sed 's/\.c$//')
+jobs=0
+cores=$(getconf _NPROCESSORS_ONLN 2> /dev/null || echo 1)
+# The largest first, so that no core waits for a long one at the end.
+tests=$(cd tests && ls -S test_*.c | sed 's/\.c$//')
 
 strict="-Wall -Wextra -pedantic -Wconversion -Wshadow -Wdouble-promotion -Wcast-qual -Wvla"
 strict_c="$strict -Wstrict-prototypes -Wmissing-prototypes"
@@ -26,18 +27,30 @@ skip() {
     skipped="$skipped; $1"
 }
 
-# run NAME COMMAND...: good when the command succeeds and prints nothing
-run() {
-    name=$1
-    shift
-    if timeout 900 "$@" > "$work/log" 2>&1 && [ ! -s "$work/log" ]; then
-        echo "ok       $name ($(($(date +%s) - clock)) s)"
-    else
-        echo "FAILED   $name"
-        tail -n 40 "$work/log" | sed 's/^/    /'
-        failures=$((failures + 1))
-    fi
-    clock=$(date +%s)
+# A job is a file, its name in the first line and its commands below. It is good when they succeed and print nothing.
+cat > "$work/run.sh" << 'SH'
+#!/bin/sh
+job=$1
+begin=$(date +%s)
+name=$(sed -n '1s/^# //p' "$job")
+if timeout 900 sh "$job" > "$job.log" 2>&1 && [ ! -s "$job.log" ]; then
+    echo "ok       $name ($(($(date +%s) - begin)) s)"
+else
+    { echo "FAILED   $name"; tail -n 40 "$job.log" | sed 's/^/    /'; } > "$job.failed"
+    cat "$job.failed"
+fi
+SH
+
+# later NAME COMMANDS: notes a job
+later() {
+    jobs=$((jobs + 1))
+    printf '# %s\n%s\n' "$1" "$2" > "$work/$(printf 'job%03d' $jobs)"
+}
+
+# together: runs the noted jobs, as many at once as there are cores
+together() {
+    ls "$work"/job??? | xargs -P "$cores" -n 1 sh "$work/run.sh"
+    rm -f "$work"/job???
 }
 
 # ---- The header alone: every language version, no warning
@@ -65,42 +78,43 @@ cp "$work/static.c" "$work/static.cpp"
 for compiler in gcc clang; do
     have $compiler || { skip $compiler; continue; }
     for standard in c99 c11 c17 gnu99; do
-        run "$compiler -std=$standard" $compiler -std=$standard $strict_c -O2 -c -o "$work/a.o" "$work/all.c"
+        later "$compiler -std=$standard" "$compiler -std=$standard $strict_c -O2 -c -o /dev/null $work/all.c"
     done
-    run "$compiler static, twice, after min and max" $compiler -std=c99 $strict_c -O2 -c -o "$work/a.o" "$work/static.c"
+    later "$compiler static, twice, after min and max" "$compiler -std=c99 $strict_c -O2 -c -o /dev/null $work/static.c"
     for option in METRO_NO_THREADS METRO_NO_TRACER; do
-        run "$compiler -D$option" $compiler -std=c99 $strict_c -D$option -O2 -c -o "$work/a.o" "$work/all.c"
+        later "$compiler -D$option" "$compiler -std=c99 $strict_c -D$option -O2 -c -o /dev/null $work/all.c"
     done
-    run "$compiler -O3 -march=native" $compiler -std=gnu99 $strict_c -O3 -march=native -c -o "$work/a.o" "$work/all.c"
+    later "$compiler -O3 -march=native" "$compiler -std=gnu99 $strict_c -O3 -march=native -c -o /dev/null $work/all.c"
 done
 for compiler in g++ clang++; do
     have $compiler || { skip $compiler; continue; }
     for standard in c++11 c++17; do
-        run "$compiler -std=$standard" $compiler -std=$standard $strict -O2 -c -o "$work/a.o" "$work/all.cpp"
-        run "$compiler -std=$standard static" $compiler -std=$standard $strict -O2 -c -o "$work/a.o" "$work/static.cpp"
+        later "$compiler -std=$standard" "$compiler -std=$standard $strict -O2 -c -o /dev/null $work/all.cpp"
+        later "$compiler -std=$standard static" "$compiler -std=$standard $strict -O2 -c -o /dev/null $work/static.cpp"
     done
 done
 if have clang; then
-    run "clang -Weverything less a written list" clang -std=c99 $everything -c -o "$work/a.o" "$work/all.c"
+    later "clang -Weverything less a written list" "clang -std=c99 $(echo $everything) -c -o /dev/null $work/all.c"
 fi
 for compiler in tcc musl-gcc; do
     have $compiler || { skip $compiler; continue; }
-    run "$compiler" $compiler -Wall -c -o "$work/a.o" "$work/all.c"
+    later "$compiler" "$compiler -Wall -c -o $work/$compiler.o $work/all.c"
 done
 if have gcc; then
-    gcc -std=c99 -c -o "$work/one.o" "$work/static2.c" && gcc -std=c99 -c -o "$work/two.o" "$work/static3.c"
-    run "two files, METRO_STATIC in both" gcc -o "$work/two" "$work/one.o" "$work/two.o" -lm
-    gcc -std=c99 -O2 -c -o "$work/a.o" "$work/all.c"
-    run "no symbol outside the prefix" sh -c "! nm -g --defined-only $work/a.o | grep -vE ' (metro_[a-z0-9_]+|main)$'"
-    run "no writable data" sh -c "! nm $work/a.o | grep -E ' [bBdDC] '"
-    run "no private macro leaks" sh -c "! gcc -std=c99 -dM -E $work/all.c | grep 'define METROI_' | grep -vE 'METROI_(UNUSED|H)\b'"
+    later "two files, METRO_STATIC in both" "gcc -std=c99 -o $work/two $work/static2.c $work/static3.c -lm"
+    later "no symbol outside the prefix, no writable data" "gcc -std=c99 -O2 -c -o $work/all.o $work/all.c
+        nm -g --defined-only $work/all.o | grep -vE ' (metro_[a-z0-9_]+|main)\$'
+        nm $work/all.o | grep -E ' [bBdDC] '
+        true"
+    later "no private macro leaks" \
+        "gcc -std=c99 -dM -E $work/all.c | grep 'define METROI_' | grep -vE 'METROI_(UNUSED|H)\b' || true"
 fi
-run "pure ASCII" sh -c "! LC_ALL=C grep -n '[^ -~	]' metro.h tests/*.[ch] examples/*.[ch] docs/*.c"
+later "pure ASCII" "LC_ALL=C grep -n '[^ -~	]' metro.h tests/*.[ch] examples/*.[ch] docs/*.c || true"
+together
 
 # ---- The tests, built and run in other ways
 # suite NAME COMPILE-COMMAND [RUN-PREFIX]: every test must compile, and close with "N passed, 0 failed". The tests of a
 # suite are shared out over the cores; each leaves its complaint, or an empty file.
-cores=$(getconf _NPROCESSORS_ONLN 2> /dev/null || echo 1)
 cat > "$work/one.sh" << 'SH'
 #!/bin/sh
 t=$1
@@ -118,9 +132,16 @@ grep -q metro_scene "tests/$t.c" || COMPILE="$COMPILE -DMETRO_NO_TRACER"
 SH
 suite() {
     rm -f "$work"/*.result
+    begin=$(date +%s)
     for t in $tests; do echo "$t"; done |
         WORK=$work COMPILE=$2 PREFIX=${3:-} xargs -P "$cores" -n 1 sh "$work/one.sh"
-    run "tests: $1" cat "$work"/*.result
+    if cat "$work"/*.result | grep . > "$work/log" || [ "$(ls "$work"/*.result | wc -l)" -ne "$(echo "$tests" | wc -w)" ]; then
+        jobs=$((jobs + 1))
+        { echo "FAILED   tests: $1"; sed 's/^/    /' "$work/log"; } > "$work/suite$jobs.failed"
+        cat "$work/suite$jobs.failed"
+    else
+        echo "ok       tests: $1 ($(($(date +%s) - begin)) s)"
+    fi
 }
 
 export METRO_TEST_SCALE=0.2
@@ -147,15 +168,16 @@ fi
 
 # ---- Ten million rays at edges and vertices, and as many for the equality of the traversals, where multiplications and
 # additions may be contracted
+# rays NAME COMPILE-COMMAND
 rays() {
-    run "1e7 rays: $1" sh -c "$2 -o $work/rays tests/test_bvh.c -lm -lpthread &&
-        METRO_TEST_SCALE=1 METRO_BVH_RAYS=1e7 $work/rays > $work/rays.log 2>&1 || { cat $work/rays.log; exit 1; }"
+    later "1e7 rays: $1" "$2 -o $work/rays_${1%% *} tests/test_bvh.c -lm -lpthread || exit
+        METRO_TEST_SCALE=1 METRO_BVH_RAYS=1e7 $work/rays_${1%% *} > $work/rays_${1%% *}.log 2>&1 || cat $work/rays_${1%% *}.log"
 }
 have gcc && rays "gcc -O3 -march=native -std=gnu99" "gcc -std=gnu99 -O3 -march=native"
 have clang && rays "clang -O3 -march=native" "clang -std=gnu99 -O3 -march=native"
+together
 
-# Under an emulator the tests run at a smaller scale, and those that render for
-# long not at all.
+# Under an emulator the tests run at a smaller scale, and those that render for long not at all.
 export METRO_TEST_SCALE=0.02
 export METRO_BVH_RAYS=20000
 tests=$(for t in $tests; do case $t in test_mlt | test_paths | test_bundles) ;; *) echo "$t" ;; esac; done)
@@ -173,26 +195,25 @@ emulated "s390x, big endian" s390x-linux-gnu-gcc "" qemu-s390x
 emulated "i686" i686-linux-gnu-gcc "-msse2 -mfpmath=sse" qemu-i386
 
 # ---- Fuzzers
+echo '#include <stddef.h>
+int LLVMFuzzerTestOneInput(const unsigned char *bytes, size_t count) { return bytes == NULL && count > 0; }' > "$work/fuzz.c"
 for fuzz in tests/fuzz_*.c; do
     target=$(basename "$fuzz" .c)
-    if have clang && clang -std=c99 -O1 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all \
-        -o "$work/$target" "$fuzz" -lm > /dev/null 2>&1; then
+    if have clang && clang -fsanitize=fuzzer,address,undefined -o "$work/fuzz" "$work/fuzz.c" > /dev/null 2>&1; then
         mkdir -p "$work/corpus_$target"
-        if timeout 300 "$work/$target" -max_total_time=20 -rss_limit_mb=512 -max_len=4096 -artifact_prefix="$work/" \
-            "$work/corpus_$target" > "$work/log" 2>&1; then
-            echo "ok       $target"
-        else
-            echo "FAILED   $target"
-            tail -n 30 "$work/log" | sed 's/^/    /'
-            failures=$((failures + 1))
-        fi
+        later "$target" "clang -std=c99 -O1 -g -fsanitize=fuzzer,address,undefined -fno-sanitize-recover=all \\
+            -o $work/$target $fuzz -lm || exit
+        $work/$target -max_total_time=20 -rss_limit_mb=512 -max_len=4096 -artifact_prefix=$work/ \\
+            $work/corpus_$target > $work/$target.log 2>&1 || { tail -n 30 $work/$target.log; exit 1; }"
     else
         skip "$target (clang with libFuzzer)"
     fi
 done
+together
 
 if [ -n "$skipped" ]; then echo "not installed, so skipped: ${skipped#; }"; fi
-if [ $failures -gt 0 ]; then
+failures=$(ls "$work" | grep -c '\.failed$')
+if [ "$failures" -gt 0 ]; then
     echo "make check: $failures failed"
     exit 1
 fi
