@@ -156,7 +156,7 @@ static void check_way(weighing *w, metroi_sample *sample, const metroi_walks *wa
     int uniform = w->tracer.uniform_directions, path_only = !w->tracer.from_lamp, h, i;
     plain_path path;
     metro_vec3 whole;
-    double sum[2] = { 0, 0 }, p;
+    double sum[2] = { 0, 0 }, p, tries;
     path.k = s + t - 1;
     w->tracer.heuristic = METRO_UNWEIGHTED;
     whole = join(&w->tracer, sample, walks[0].y, walks[0].z, s, t);
@@ -172,8 +172,10 @@ static void check_way(weighing *w, metroi_sample *sample, const metroi_walks *wa
     p = plain_path_density(&path, s);
     CHECK(same_color(whole, metro_scale(path.contribution, 1 / p), 1e-3), "way (%d, %d): %.12g, f / p is %.12g", s, t,
           whole.x, path.contribution.x / p);
+    /* a way to the film is tried for one in so many walks from the eye */
+    tries = t == 1 ? p / w->tracer.eye_walks : p;
     for (i = 0; i <= path.k; i++) {
-        double q = plain_path_density(&path, i) / p;
+        double q = plain_path_density(&path, i) / (i == path.k ? w->tracer.eye_walks : 1) / tries;
         /* walks from the eye alone meet the lamp or aim at it; when the eye sees the lamp they can only meet it */
         if (path_only && i > (path.k > 1 ? 1 : 0)) continue;
         sum[0] += q * q;
@@ -235,7 +237,7 @@ static metro_scene room_scene(void)
 }
 
 /* Each way of each path counts f / p, and f / p times its weight of eq 12.3, as products of the densities of all
-   vertices from both sides say that are computed here from the corners of the path. Catches: any cosine or distance
+   vertices from both sides say that are computed here from the corners of the path, and as often as each is tried. Catches: any cosine or distance
    dropped or squared, a reverse density for the other direction, a nest that misses a link, the lamp's emission drawn
    uniformly, the camera's density in the wrong place, 1 for 1/(4 pi). */
 static void weights_by_products(void)
@@ -516,9 +518,58 @@ static void furnaces(void)
         furnace(i, 0.2, 3, 6, 64, 0.1);
     }
     furnace(5, 1, 1, 8, 256, 0.001);
-    furnace(0, 1, 1, 8, 400, 0.001);
+    furnace(0, 1, 1, 8, 800, 0.001);
     furnace(3, 1, 1, 8, 256, 0.005);
     furnace(7, 0.5, 1, 8, 256, 0.01);
+}
+
+/* A walk from a lamp serves a group of pixels: in pictures whose pixels make no whole groups the mean is right, and the
+   error that few rounds give knows that a group has a walk in common: in a furnace, where no pixel is brighter than
+   another, it is the spread over runs. Catches: pixels left out or counted twice, a walk that serves fewer than it is
+   counted for, samples of a group taken for independent. */
+static void groups_of_pixels(void)
+{
+    static const size_t size[6][2] = { { 1, 1 }, { 3, 1 }, { 7, 1 }, { 5, 13 }, { 16, 17 }, { 31, 9 } };
+    metro_scene scene = furnace_scene(0.6, 2);
+    metro_camera camera = inside_camera();
+    double truth = furnace_radiance(0.6, 2, 1, 4), z2 = 0;
+    int i, runs = (int)check_count(300, 60), strange = 0;
+    metro_render_report report;
+    metro_image image;
+    size_t p;
+    for (i = 0; i < 6; i++) {
+        metro_render_options options = options_make(METRO_BDPT, 1, 4);
+        metro_render render;
+        options.width = size[i][0];
+        options.height = size[i][1];
+        render = render_run(&scene, &camera, &options,
+                            check_count(160 * (double)(300 / (size[i][0] * size[i][1]) + 1), 160));
+        metro_render_diagnose(&render, &report);
+        CHECK(fabs(report.mean - truth) <= student_bound(15) * report.mean_error, "%d x %d: %.6g +- %.2g, should be %.6g",
+              (int)size[i][0], (int)size[i][1], report.mean, report.mean_error, truth);
+        CHECK(report.mean_error < 0.02 * truth / sqrt(check_scale()), "%d x %d: error %g", (int)size[i][0],
+              (int)size[i][1], report.mean_error);
+        image = render_image(&render);
+        for (p = 0; p < size[i][0] * size[i][1]; p++)
+            if (!(fabs(image_luminance(&image, p) / truth - 1) < 0.5)) strange++;
+        CHECK(strange == 0, "%d x %d: %d pixels are half as bright or half again", (int)size[i][0], (int)size[i][1],
+              strange);
+        metro_image_free(&image);
+        metro_render_free(&render);
+    }
+    for (i = 0; i < runs; i++) {
+        metro_render_options options = options_make(METRO_BDPT, 16, 4);
+        metro_render render;
+        options.random_numbers = 1;
+        options.seed = 70 + (uint64_t)i;
+        render = render_run(&scene, &camera, &options, 3);
+        metro_render_diagnose(&render, &report);
+        z2 += (report.mean - truth) * (report.mean - truth) / (report.mean_error * report.mean_error) / runs;
+        metro_render_free(&render);
+    }
+    /* the mean of squares of about 190 degrees of freedom each varies by sqrt(2/runs) */
+    CHECK(fabs(z2 - 1) <= 4 * sqrt(2.0 / runs), "%d runs of three rounds: mean square %g of mean / error", runs, z2);
+    metro_scene_free(&scene);
 }
 
 /* A sphere of 8 * 4^level triangles seen from inside, from an octahedron; its half y > 0 has another material. */
@@ -1192,6 +1243,7 @@ int main(void)
     CHECK_RUN(pyramid_sums);
     CHECK_RUN(methods_agree);
     CHECK_RUN(furnaces);
+    CHECK_RUN(groups_of_pixels);
     CHECK_RUN(sphere);
     CHECK_RUN(beyond_floats);
     CHECK_RUN(references);
