@@ -1550,8 +1550,8 @@ typedef struct {
 
 /* What a careful person asks. NaN stands for what a method does not have. */
 typedef struct {
-    double mean, mean_error;  /* the mean luminance of the patches in the picture, each by its share and even over the
-                                 patch, lamps seen directly left out; and its error */
+    double mean, mean_error;  /* the mean luminance of the picture, with each patch by its share of it and even over
+                                 the patch; and its error */
     double b, b_error;        /* the integral of the importance, and its standard error */
     double acceptance;        /* the share of mutations that were accepted */
     double dark;              /* the share of tentative states of zero importance */
@@ -16388,7 +16388,18 @@ METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_i
     return result;
 }
 
-/* The mean luminance of the patches in the picture, batch by batch. */
+/* The mean luminance of the picture: what its lamps emit is known, and what its patches reflect is the mean over the
+   batches. */
+
+static double metroi_bundles_seen(const metroi_bundles *plan)
+{
+    double luminance = 0;
+    size_t i;
+    for (i = 0; i < plan->patches.count; i++)
+        luminance += plan->share[i]
+                   * metroi_color_luminance(metroi_surface_of(plan, plan->patches.patch[i].triangle)->emission);
+    return luminance;
+}
 
 static double metroi_bundles_mean(const metroi_bundles *plan, double *error)
 {
@@ -16408,7 +16419,7 @@ static double metroi_bundles_mean(const metroi_bundles *plan, double *error)
     mean = metro_moments_mean(&moments);
     spread = metro_moments_error(&moments);
     *error = sqrt(spread * spread + mean * mean * scale.b_share * scale.b_share);
-    return mean;
+    return metroi_bundles_seen(plan) + mean;
 }
 
 METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundles_report *report)

@@ -3,8 +3,9 @@
        merge room.pfm share0.pfm share1.pfm share2.pfm share3.pfm
 
    Each share counts by its weight, the number of its samples, which stands in SHARE.pfm.txt. Shares are independent,
-   so their spread says how far the merged picture is off, whatever method made them. room.pfm.txt says what is in
-   room.pfm, so merged pictures can be merged again: shares of shares, or shares that came later.
+   so their spread says how far the merged picture is off, whatever method made them; one method, of one scene, for
+   all. room.pfm.txt says what is in room.pfm, so merged pictures can be merged again: shares of shares, or shares
+   that came later.
 
    --error FILE.pfm also writes the standard error of each pixel. --png FILE.png also writes the picture for the eye.
 
@@ -16,12 +17,12 @@
 #include "../metro.h"
 #include "plot.h"
 
-static const char header[] = "weight,seed,part,parts";
+static const char header[] = "weight,seed,part,parts,picture";
 
 /* A row of a weight file: which share, and how much it counts. */
 typedef struct {
-    double weight;
-    uint64_t seed, part, parts;
+    uint64_t weight, seed, part, parts;
+    uint64_t picture; /* one number for the scene, the camera, the method and its options */
     const char *path; /* of the picture it is in */
 } share;
 
@@ -69,14 +70,12 @@ static int read_whole(const char **text, char end, uint64_t *value)
 static int read_share(char *line, share *s)
 {
     const char *at = line;
-    uint64_t weight;
     size_t length = strcspn(line, "\r\n");
     line[length] = 0;
-    if (!read_whole(&at, ',', &weight) || !read_whole(&at, ',', &s->seed) || !read_whole(&at, ',', &s->part))
+    if (!read_whole(&at, ',', &s->weight) || !read_whole(&at, ',', &s->seed) || !read_whole(&at, ',', &s->part))
         return 0;
-    if (!read_whole(&at, 0, &s->parts)) return 0;
-    s->weight = (double)weight;
-    return weight > 0;
+    if (!read_whole(&at, ',', &s->parts) || !read_whole(&at, 0, &s->picture)) return 0;
+    return s->weight > 0;
 }
 
 static int add_share(share_list *list, const share *s)
@@ -97,10 +96,10 @@ static int read_weight_lines(FILE *file, const char *path, const char *name, sha
     char line[200];
     share s;
     if (fgets(line, sizeof line, file) == NULL || strncmp(line, header, sizeof header - 1) != 0)
-        return complain(name, "its first line is not weight,seed,part,parts");
+        return complain(name, "its first line is not weight,seed,part,parts,picture");
     while (fgets(line, sizeof line, file) != NULL) {
         s.path = path;
-        if (!read_share(line, &s)) return complain(name, "a row is not four whole numbers with a weight above 0");
+        if (!read_share(line, &s)) return complain(name, "a row is not five whole numbers with a weight above 0");
         if (add_share(list, &s) != 0) return 1;
     }
     return 0;
@@ -132,7 +131,7 @@ static double weight_of(const share_list *list, const char *path)
     double sum = 0;
     size_t i;
     for (i = 0; i < list->count; i++)
-        if (list->item[i].path == path) sum += list->item[i].weight;
+        if (list->item[i].path == path) sum += (double)list->item[i].weight;
     return sum;
 }
 
@@ -153,6 +152,18 @@ static int check_twice(const share_list *list)
         if (twin == NULL) continue;
         fprintf(stderr, "merge: %s and %s hold the same share, seed %llu, part %llu: leave one out\n", twin->path,
                 s->path, (unsigned long long)s->seed, (unsigned long long)s->part);
+        return 1;
+    }
+    return 0;
+}
+
+static int check_same(const share_list *list)
+{
+    size_t i;
+    for (i = 1; i < list->count; i++) {
+        if (list->item[i].picture == list->item[0].picture) continue;
+        fprintf(stderr, "merge: %s and %s do not belong together: another scene, camera, method, size, depth or option\n",
+                list->item[0].path, list->item[i].path);
         return 1;
     }
     return 0;
@@ -257,15 +268,15 @@ static int save_pfm(const metro_image *image, const char *path)
 static int save_weights(const char *name, const share_list *list)
 {
     plot_csv csv = plot_csv_open(name, header);
-    char text[64];
     size_t i;
     for (i = 0; i < list->count; i++) {
         const share *s = &list->item[i];
-        snprintf(text, sizeof text, "%.0f", s->weight);
-        plot_csv_text(&csv, text);
-        snprintf(text, sizeof text, "%llu", (unsigned long long)s->seed);
-        plot_csv_text(&csv, text);
-        PLOT_CSV_ROW(&csv, (double)s->part, (double)s->parts);
+        plot_csv_whole(&csv, s->weight);
+        plot_csv_whole(&csv, s->seed);
+        plot_csv_whole(&csv, s->part);
+        plot_csv_whole(&csv, s->parts);
+        plot_csv_whole(&csv, s->picture);
+        plot_csv_row(&csv, NULL, 0);
     }
     return plot_csv_close(&csv);
 }
@@ -336,7 +347,7 @@ static int read_request(int argc, char **argv, request *r)
                                                               : NULL;
         if (target != NULL && i + 1 == argc) return refuse(argv[i], "a file name must follow");
         if (target != NULL) *target = argv[++i];
-        else if (argv[i][0] == '-') return refuse(argv[i], "there is no such option; only --error and --png");
+        else if (argv[i][0] == '-') return refuse(argv[i], "there is no such option; merge --help lists them");
         else argv[names++] = argv[i];
     }
     if (names < 2) return refuse("usage", "merge OUT.pfm SHARE.pfm ... [--error FILE.pfm] [--png FILE.png]");
@@ -356,6 +367,7 @@ static int merge(const request *r, share_list *list, sums *s)
 {
     int i, status = 0;
     for (i = 0; i < r->count && status == 0; i++) status = read_weights(r->in[i], list, 0);
+    if (status == 0) status = check_same(list);
     if (status == 0) status = check_twice(list);
     if (status == 0) status = check_target(r->out, list);
     for (i = 0; i < r->count && status == 0; i++) {
@@ -374,12 +386,22 @@ static int merge(const request *r, share_list *list, sums *s)
     return status;
 }
 
+static int show_help(void)
+{
+    puts("merge OUT.pfm SHARE.pfm ... [--error FILE.pfm] [--png FILE.png]\n\n"
+         "Makes one picture of the shares of `render --part i/n`, each by its number of samples, and says by their\n"
+         "spread how far it is off. --error also writes the standard error of each pixel, --png a picture for the eye.");
+    return 0;
+}
+
 int main(int argc, char **argv)
 {
     request r = { NULL, NULL, NULL, NULL, 0 };
     share_list list = { NULL, 0, 0 };
     sums s;
-    int status = read_request(argc, argv, &r);
+    int status;
+    if (argc == 2 && (strcmp(argv[1], "--help") == 0 || strcmp(argv[1], "-h") == 0)) return show_help();
+    status = read_request(argc, argv, &r);
     memset(&s, 0, sizeof s);
     if (status == 0) status = merge(&r, &list, &s);
     free_sums(&s);

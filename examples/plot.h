@@ -279,6 +279,14 @@ PLOT_API void plot_csv_text(plot_csv *csv, const char *text)
 }
 
 /* Numbers as the rest of the row, and its end. */
+/* A whole number too large for a double, such as a seed. */
+PLOT_API void plot_csv_whole(plot_csv *csv, unsigned long long value)
+{
+    char text[32];
+    snprintf(text, sizeof text, "%llu", value);
+    plot_csv_text(csv, text);
+}
+
 PLOT_API void plot_csv_row(plot_csv *csv, const double *value, size_t count)
 {
     size_t i;

@@ -304,7 +304,7 @@ static int read_request(int argc, char **argv, request *r)
     int i, status = 0;
     memset(r, 0, sizeof *r);
     for (i = 1; i < argc && status == 0; i++) {
-        if (strcmp(argv[i], "--help") == 0) return show_help();
+        if (strcmp(argv[i], "--help") == 0 || strcmp(argv[i], "-h") == 0) return show_help();
         if (argv[i][0] == '-') {
             status = read_option(r, argv[i], i + 1 < argc ? argv[i + 1] : NULL);
             i++;
@@ -639,17 +639,65 @@ static int run(work *w)
 
 /* ---- Pictures, weight and table ---- */
 
-/* Writes PATH.txt, the weight of a share and which one it is; merge reads it. */
+/* FNV-1a (Fowler, Noll and Vo 1991) of a number. */
+static void add_key(uint64_t *key, double number)
+{
+    uint64_t bits;
+    int i;
+    memcpy(&bits, &number, sizeof bits);
+    for (i = 0; i < 64; i += 8) *key = (*key ^ (bits >> i & 255)) * UINT64_C(0x100000001b3);
+}
+
+static void add_vector(uint64_t *key, metro_vec3 v)
+{
+    add_key(key, v.x);
+    add_key(key, v.y);
+    add_key(key, v.z);
+}
+
+/* One number for what was rendered and how, but for the noise: shares that have another one do not belong together. */
+static uint64_t picture_key(const work *w)
+{
+    const metro_scene *scene = &w->scene;
+    const metro_bundles_options *bundles = &w->bundles.options;
+    uint64_t key = UINT64_C(0xcbf29ce484222325);
+    size_t i;
+    for (i = 0; i < 9 * scene->triangle_count; i++) add_key(&key, (double)scene->corner[i]);
+    for (i = 0; i < scene->triangle_count; i++) add_key(&key, scene->material_of[i]);
+    for (i = 0; i < scene->material_count; i++) {
+        add_vector(&key, scene->material[i].kd);
+        add_vector(&key, scene->material[i].ks);
+        add_vector(&key, scene->material[i].ke);
+        add_key(&key, scene->material[i].ns);
+    }
+    add_vector(&key, w->camera.eye);
+    add_vector(&key, w->camera.look);
+    add_vector(&key, w->camera.up);
+    add_key(&key, w->camera.fov);
+    add_key(&key, (double)w->asked.answers[METHOD].whole[0]);
+    add_key(&key, (double)w->image.width);
+    add_key(&key, w->made.depth);
+    add_key(&key, w->made.perturbation);
+    add_key(&key, w->made.large_step);
+    add_key(&key, (double)w->made.chains);
+    add_key(&key, w->options.start);
+    if (!is_bundle(w)) return key;
+    add_key(&key, bundles->patch);
+    add_key(&key, (double)bundles->grid);
+    return key;
+}
+
+/* Writes PATH.txt, the weight of a share, which one it is and of what; merge reads it. */
 static int save_weight(const work *w, const char *path)
 {
     const uint64_t *part = w->asked.answers[PART].whole;
-    char text[32];
-    plot_csv csv = plot_csv_open(path, "weight,seed,part,parts");
-    snprintf(text, sizeof text, "%llu", (unsigned long long)w->made.samples);
-    plot_csv_text(&csv, text);
-    snprintf(text, sizeof text, "%llu", (unsigned long long)w->options.seed);
-    plot_csv_text(&csv, text);
-    PLOT_CSV_ROW(&csv, (double)part[0], (double)part[1]);
+    plot_csv csv = plot_csv_open(path, "weight,seed,part,parts,picture");
+    plot_csv_whole(&csv, w->made.samples);
+    plot_csv_whole(&csv, w->options.seed);
+    plot_csv_whole(&csv, part[0]);
+    plot_csv_whole(&csv, part[1]);
+    plot_csv_whole(&csv, picture_key(w));
+    plot_csv_row(&csv, NULL, 0);
     return plot_csv_close(&csv);
 }
 
@@ -687,15 +735,13 @@ static void fill_row(const work *w, plot_csv *csv)
     const outcome *m = &w->made;
     const metro_render_report *p = &w->report;
     int walks = !isnan(p->acceptance), compared = w->reference.value != NULL;
-    char seed[32];
-    snprintf(seed, sizeof seed, "%llu", (unsigned long long)w->options.seed);
     plot_csv_text(csv, w->asked.scene);
     plot_csv_text(csv, method_name[w->asked.answers[METHOD].whole[0]]);
     plot_csv_text(csv, walks ? start_name[w->options.start] : "");
     plot_csv_number(csv, (double)w->image.width);
     plot_csv_number(csv, (double)w->image.height);
     plot_csv_number(csv, (double)m->depth);
-    plot_csv_text(csv, seed);
+    plot_csv_whole(csv, w->options.seed);
     plot_csv_number(csv, (double)w->options.part);
     plot_csv_number(csv, w->asked.answers[PART].given ? (double)w->asked.answers[PART].whole[1] : 1);
     plot_csv_number(csv, (double)m->rounds);

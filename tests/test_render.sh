@@ -361,9 +361,9 @@ if [ -n "$comma" ]; then
 fi
 
 # Shares. First by hand: 1 of weight 3 and 5 of weight 1 have the mean 2 and the standard error sqrt(3).
-hand() { # hand FILE BYTES WEIGHT PART: a grey picture of one pixel
+hand() { # hand FILE BYTES WEIGHT PART [PICTURE]: a grey picture of one pixel
     printf "Pf\n1 1\n-1.0\n$2" > "$1"
-    printf 'weight,seed,part,parts\n%s,0,%s,2\n' "$3" "$4" > "$1.txt"
+    printf 'weight,seed,part,parts,picture\n%s,0,%s,2,%s\n' "$3" "$4" "${5:-18446744073709551615}" > "$1.txt"
 }
 hand one.pfm '\000\000\200\077' 3 0
 hand five.pfm '\000\000\240\100' 1 1
@@ -373,7 +373,8 @@ same "the mean by weight" sum.pfm two
 says "the standard error" '^mean luminance 2 +- 1.7$'
 [ "$(tail -c 4 error.pfm | od -An -tx1 | tr -d ' \n')" = d7b3dd3f ] && [ -s sum.png ]
 result "the standard error of a pixel" $?
-[ "$(tr '\n' ' ' < sum.pfm.txt)" = "weight,seed,part,parts 3,0,0,2 1,0,1,2 " ]
+[ "$(tr '\n' ' ' < sum.pfm.txt)" = \
+  "weight,seed,part,parts,picture 3,0,0,2,18446744073709551615 1,0,1,2,18446744073709551615 " ]
 result "the merged picture knows its shares" $?
 works "merged again" "$merge" sum.pfm one.pfm five.pfm
 hand three.pfm '\000\000\200\077' 4 2
@@ -387,13 +388,15 @@ refuses "nothing to merge" 2 'merge OUT.pfm SHARE.pfm' "$merge" b.pfm
 refuses "an unknown option of merge" 2 '--what' "$merge" b.pfm one.pfm --what
 refuses "no such share" 1 'none.pfm.txt' "$merge" b.pfm none.pfm
 refuses "no weight" 1 'a.pfm.txt' "$merge" b.pfm a.pfm
-for row in 0,0,0,2 -1,0,0,2 1,0,0 1,0,0,2x nan,0,0,2; do
+for row in 0,0,0,2,0 -1,0,0,2,0 1,0,0,2 1,0,0,2,0x 1,0,0,2,18446744073709551616 nan,0,0,2,0; do
     hand bad.pfm '\000\000\200\077' 1 1
-    printf 'weight,seed,part,parts\n%s\n' $row > bad.pfm.txt
+    printf 'weight,seed,part,parts,picture\n%s\n' $row > bad.pfm.txt
     refuses "a weight of '$row'" 1 'bad.pfm.txt' "$merge" b.pfm one.pfm bad.pfm
 done
 cp a.pfm wide.pfm
-printf 'weight,seed,part,parts\n1,0,7,8\n' > wide.pfm.txt
+sed s/3,0,0,2/1,0,7,8/ one.pfm.txt > wide.pfm.txt
+hand alien.pfm '\000\000\200\077' 1 5 18446744073709551614
+refuses "a share of another picture" 1 'do not belong together' "$merge" b.pfm one.pfm alien.pfm
 refuses "shares of two sizes" 1 'another size' "$merge" b.pfm one.pfm wide.pfm
 refuses "a folder for merge that is not there" 1 'none/b.pfm' "$merge" none/b.pfm one.pfm
 
@@ -401,12 +404,38 @@ refuses "a folder for merge that is not there" 1 'none/b.pfm' "$merge" none/b.pf
 for part in 0 1 2; do
     works "share $part" "$render" room.obj $small --part $part/3 --rounds $((50 + 50 * part)) --out share$part.pfm
 done
-[ "$(cat share1.pfm.txt | tr '\n' ' ')" = "weight,seed,part,parts 19200,0,1,3 " ]
+[ "$(tr '\n' ' ' < share1.pfm.txt | sed 's/,[0-9]* $//')" = "weight,seed,part,parts,picture 19200,0,1,3" ]
 result "a weight" $?
 works "a share as long as the first" "$render" room.obj $small --part 2/3 --rounds 50 --out other.pfm
 ! cmp -s share0.pfm other.pfm
 result "shares are independent" $?
 works "shares merged" "$merge" shares.pfm share?.pfm
+works "the same options in other words" "$render" room.obj $small --method bdpt --fov 40 --seed 3 --rounds 9 \
+    --part 3/4 --out words.pfm
+works "merging it" "$merge" b.pfm share0.pfm words.pfm
+sed 's/room.mtl/pale.mtl/' room.obj > pale.obj
+sed 's/Kd .7 .7 .7/Kd .7 .7 .6/' room.mtl > pale.mtl
+last=
+while read -r scene other; do
+    works "a share of $scene $other" "$render" $scene $small --part 7/9 --seconds .01 $other --out other.pfm
+    refuses "merging a share of $scene $other" 1 'do not belong together' "$merge" new.pfm share0.pfm other.pfm
+    [ "$(tail -n 1 other.pfm.txt)" != "$last" ]
+    result "$scene $other is another picture than the one before" $?
+    last=$(tail -n 1 other.pfm.txt)
+done << 'END'
+room.obj --method path
+room.obj --depth 3
+room.obj --size 12x16
+room.obj --eye 0,1,2
+room.obj --fov 50
+pale.obj --fov 40
+room.obj --method mlt
+room.obj --method mlt --perturbation .1
+room.obj --method mlt --start point
+room.obj --method bundle
+room.obj --method bundle --patch .7
+room.obj --method bundle --patch .7 --grid 9
+END
 works "against the reference" "$render" room.obj --depth 4 --reference shares.pfm --rounds 400 --seed 9 --out b.pfm
 below "the merged picture is right" .03
 
