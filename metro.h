@@ -15548,7 +15548,8 @@ typedef struct {
     size_t axis_count;
     metroi_batch *batch;     /* [options->batches] */
     uint64_t key;
-    uint64_t rounds;
+    uint64_t rounds;         /* made so far, of one walk a batch */
+    uint64_t at_once;        /* how many a batch makes before it waits for the others */
     size_t alive;            /* chains that found a start */
     metro_bundles *shown;    /* whose numbers grow, and whom to ask whether to stop */
     int (*stop)(const metro_bundles *bundles, void *user);
@@ -15794,17 +15795,15 @@ static void metroi_walk_choose(metroi_batch *batch, uint64_t round, uint64_t scr
     for (k = 3 * d; k < 5 * d; k++) batch->state[k] = metro_rng_uniform(rng);
 }
 
-static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
+/* Walk number `round` of a batch. */
+static void metroi_walk_draw(metroi_bundles *plan, size_t index, uint64_t round)
 {
-    metroi_bundles *plan = (metroi_bundles *)user;
-    size_t index = (size_t)(job % plan->options.batches), i;
     metroi_batch *batch = &plan->batch[index];
-    metro_rng rng = metro_rng_make(plan->key, job);
-    (void)slot;
-    metroi_walk_choose(batch, job / plan->options.batches, metroi_mix(plan->key + index), &rng);
+    metro_rng rng = metro_rng_make(plan->key, round * plan->options.batches + index);
+    size_t i;
+    metroi_walk_choose(batch, round, metroi_mix(plan->key + index), &rng);
     metroi_bundles_walk(batch, batch->state, &rng, batch->out);
     for (i = 0; i < 3 * batch->bundle.nodes * plan->patches.count; i++) batch->sum[i] += batch->out[i];
-    return METRO_OK;
 }
 
 /* # 14.10 Metropolis walks
@@ -15944,16 +15943,12 @@ static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
 
 /* A step of one chain. Without large steps b needs a draw of its own now and then: one for sixteen mutations. */
 
-static metro_result metroi_walk_step(uint64_t job, void *slot, void *user)
+static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
 {
-    metroi_bundles *plan = (metroi_bundles *)user;
-    metroi_batch *batch = &plan->batch[job % plan->options.batches];
-    uint64_t round = job / plan->options.batches;
-    (void)slot;
-    if (!batch->alive) return METRO_OK;
+    metroi_batch *batch = &plan->batch[index];
+    if (!batch->alive) return;
     metro_chain_run(&batch->chain, 1);
     if (!(plan->options.large_step > 0) && round % 16 == 15) metro_chain_survey(&batch->chain, 1);
-    return METRO_OK;
 }
 
 /* # 14.11 The picture
@@ -16162,7 +16157,20 @@ METRO_API metro_result metro_bundles_make(const metro_scene *scene, const metro_
     return result;
 }
 
-/* Rounds of one walk a batch. */
+/* A job is a batch. It makes one walk and waits for the others, so that somebody can ask whether to stop; where nobody
+   does it makes all its walks, and no thread waits but at the end. */
+
+static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
+{
+    metroi_bundles *plan = (metroi_bundles *)user;
+    size_t index = (size_t)(job % plan->options.batches);
+    uint64_t round, end = plan->rounds + plan->at_once;
+    (void)slot;
+    for (round = plan->rounds; round < end; round++)
+        if (plan->options.walk == METRO_WALK_METROPOLIS) metroi_walk_step(plan, index, round);
+        else metroi_walk_draw(plan, index, round);
+    return METRO_OK;
+}
 
 static int metroi_bundles_stop(uint64_t rounds, void *user)
 {
@@ -16170,8 +16178,8 @@ static int metroi_bundles_stop(uint64_t rounds, void *user)
     metro_bundles *shown = plan->shown;
     size_t i;
     (void)rounds;
-    plan->rounds++;
-    shown->walks += plan->options.batches;
+    plan->rounds += plan->at_once;
+    shown->walks += plan->at_once * plan->options.batches;
     shown->bundles = shown->rays = 0;
     for (i = 0; i < plan->options.batches; i++) {
         shown->bundles += plan->batch[i].bundles;
@@ -16213,9 +16221,10 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
     memset(&rounds, 0, sizeof rounds);
     rounds.jobs = plan->options.batches;
     rounds.rounds = walks / rounds.jobs + (walks % rounds.jobs != 0);
-    rounds.first_round = plan->rounds;
+    plan->at_once = stop == NULL ? rounds.rounds : 1;
+    rounds.rounds /= plan->at_once;
     rounds.threads = plan->options.threads;
-    rounds.work = plan->options.walk == METRO_WALK_METROPOLIS ? metroi_walk_step : metroi_bundles_work;
+    rounds.work = metroi_bundles_work;
     rounds.stop = metroi_bundles_stop;
     return metro_rounds_run(&rounds, plan);
 }

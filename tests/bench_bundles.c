@@ -47,7 +47,7 @@ static double bundle_cost(const metro_patches *patches, size_t grid, metro_visib
     int run, n;
     if (metroi_bundle_make(patches, grid, visibility, 0, &bundle) != METRO_OK) exit(1);
     for (i = 0; i < 4 * patches->count; i++) bundle.radiance[i] = 1;
-    for (run = 0; run < 5; run++) {
+    for (run = 0; run < 12; run++) {
         metro_rng rng = metro_rng_make(1, 0);
         double start = seconds(), spent;
         for (n = 0; n < 16; n++) {
@@ -180,7 +180,7 @@ static void two_threads(void)
     double least[2] = { 1e9, 1e9 };
     int run, t;
     load("S2", 0, &scene);
-    for (run = 0; run < 5; run++)
+    for (run = 0; run < 12; run++)
         for (t = 0; t < 2; t++) {
             metro_bundles_options options = options_of(METRO_LINES, METRO_WALK_RANDOM, 1);
             metro_bundles bundles;

@@ -866,12 +866,19 @@ static void narrow_lamp(void)
 
 /* ---- what a program needs ---- */
 
-/* One, two and three threads, in one call or in several, give the same bits. */
+static int never_stop(const metro_bundles *bundles, void *user)
+{
+    (void)bundles;
+    ++*(int *)user;
+    return 0;
+}
+
+/* One, two and three threads, in one call or in several, asked whether to stop or not, give the same bits. */
 static void threads(void)
 {
     metro_scene scene = room_scene(0.3);
     metro_camera camera = inside_camera();
-    int walk, shot, t;
+    int walk, shot, t, asked = 0;
     for (walk = 0; walk < 3; walk++)
         for (shot = 0; shot < 2; shot++) {
             metro_vec3 *first = NULL;
@@ -886,7 +893,7 @@ static void threads(void)
                 options.linear = shot && walk == 0;
                 options.threads = (size_t)t + 1;
                 bundles = bundles_run(&scene, &camera, &options, t == 1 ? 17 : 64);
-                if (t == 1) metro_bundles_run(&bundles, 32, NULL, NULL);
+                if (t == 1) metro_bundles_run(&bundles, 32, never_stop, &asked);
                 CHECK(bundles.walks == 64, "%g walks", (double)bundles.walks);
                 radiance = radiance_of(&bundles, NULL);
                 size = bundles.patches.count * sizeof *radiance;
@@ -903,6 +910,7 @@ static void threads(void)
             for (t = 0; t < 3; t++) metro_image_free(&image[t]);
             free(first);
         }
+    CHECK(asked == 12, "asked %d times", asked);
     metro_scene_free(&scene);
 }
 
