@@ -1428,7 +1428,7 @@ METRO_API void metro_render_free(metro_render *render);
        metro_bundles_run(&bundles, 1024, NULL, NULL);
        metro_bundles_image(&bundles, &image);
 
-   With these two options a picture has the least noise for its time; without them it is made as in the paper. */
+   Both options lower the noise of a second; without them a picture is made as in the paper. */
 
 /* One patch: a part of a triangle, similar to it. */
 typedef struct {
@@ -1451,25 +1451,26 @@ typedef struct {
 } metro_patches;
 
 /* Cuts each triangle of `scene` regularly into similar ones, n times n, with the smallest n that leaves no edge
-   longer than `size` (a part in a million is let pass). The scene is read later on and must stay; it need not be
-   built. Returns METRO_ERROR_ARGUMENT for a NULL or a size that is not positive, METRO_ERROR_MEMORY, also for more
-   than 2^30 patches; `patches` is then unchanged. Cost: linear, 112 bytes a patch. Source: section 14.1. */
+   longer than `size` (a part in a million is let pass). The scene is read later on and must stay as it is; it need
+   not be built. Returns METRO_ERROR_ARGUMENT for a NULL or a size that is not positive, METRO_ERROR_MEMORY, also for
+   more than 2^30 patches; `patches` is then unchanged. Cost: linear, 112 bytes a patch. Source: section 14.1. */
 METRO_API metro_result metro_patches_make(const metro_scene *scene, double size, metro_patches *patches);
 
 /* Gives back all memory; zeroed patches are allowed. */
 METRO_API void metro_patches_free(metro_patches *patches);
 
-/* The number of the patch that holds the point (1-u-v) p0 + u p1 + v p2 of a triangle, as metro_hit gives it; a point
-   outside the triangle counts to the nearest patches of its border. The number of patches, `count`, where the
+/* The number of the patch that holds the point (1-u-v) p0 + u p1 + v p2 of a triangle, as metro_hit gives it; one
+   that rounding left outside the triangle counts to a patch at the border. The number of patches, `count`, where the
    triangle has none. Cost: constant. */
 METRO_API size_t metro_patches_at(const metro_patches *patches, uint32_t triangle, double u, double v);
 
 /* Which patch faces which along the lines of a bundle. The lines are those of a square grid, randomly shifted. */
 typedef enum {
-    METRO_SWEEP,      /* exact: sweeps each row of the grid and keeps the triangles above each other in order */
-    METRO_FRAGMENTS,  /* exact: lists what each line meets and sorts the lists; plainer, the same answer */
+    METRO_SWEEP,      /* sweeps each row of the grid and keeps the triangles above each other in order: exact, unless
+                         triangles pass through each other */
+    METRO_FRAGMENTS,  /* lists what each line meets and sorts the lists: exact, and slower */
     METRO_PAINTER,    /* paints whole patches in the order of their centres (the paper's time): wrong by a bias */
-    METRO_LINES       /* infinitely many lines in each row: exact along the row */
+    METRO_LINES       /* METRO_SWEEP with infinitely many lines in each row: exact along the row */
 } metro_visibility;
 
 /* What became of the radiance that a bundle moved, each the sum over its lines of radiance times the area of a cell,
@@ -1489,13 +1490,16 @@ typedef struct {
        sum_{j} frac{A(i, j)}{A_i} L_j
 
    with A(i, j) the projected area of j that i sees: radiance times the cosine at i. With uniform directions of the
-   sphere and uniform shifts its mean times 2 pi is the irradiance of the patch, whatever the size of its cells and
-   patches; only METRO_PAINTER is off. `radiance` and `received` have `patches->count` items and may be the same;
-   `balance` may be NULL. Returns METRO_ERROR_ARGUMENT for a direction of no length or not finite, a grid of 0 or
-   above 16384, a shift outside [0, 1), a visibility that there is not, or a NULL; METRO_ERROR_MEMORY; then the
-   outputs are unchanged. Cost: METRO_SWEEP and METRO_LINES one step for each row of the grid and each patch it
-   crosses, METRO_FRAGMENTS and METRO_PAINTER one for each cell of each patch. Source: Szirmay-Kalos and Purgathofer
-   (1998); paper (19), eq 14.4. */
+   sphere and uniform shifts its mean times 2 pi is the irradiance of the patch, whatever the size of cells and
+   patches, but for METRO_PAINTER, and for METRO_SWEEP and METRO_LINES where triangles pass through each other; the
+   variance of a patch grows as the area of a cell over its own. `radiance` and `received` have `patches->count` items
+   and may be the same; `balance` may be NULL. Returns METRO_ERROR_ARGUMENT for a direction of no length or not
+   finite, a grid of 0 or above 16384, a shift outside [0, 1), a visibility that there is not, patches that were not
+   made, or a NULL; METRO_ERROR_MEMORY; then the outputs are unchanged. Cost: METRO_SWEEP and METRO_LINES one step for
+   each row of the grid and each patch it crosses, and for each triangle in a row as many as there are triangles above
+   each other; METRO_FRAGMENTS one for each cell of each patch and as many as patches are above each other;
+   METRO_PAINTER one for each cell of each patch; and memory for all that is allocated and cleared. A run of walks
+   does so once. Source: Szirmay-Kalos and Purgathofer (1998); paper (19), eq 14.4. */
 METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro_vec3 direction, size_t grid,
                                              const double shift[2], metro_visibility visibility,
                                              const metro_vec3 *radiance, metro_vec3 *received,
@@ -1504,8 +1508,8 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
 /* How the directions of a walk are chosen. */
 typedef enum {
     METRO_WALK_RANDOM,     /* each uniform and independent */
-    METRO_WALK_EVEN,       /* the points of an evenly filling sequence with two coordinates for each of the first 16
-                              directions; the rest is random */
+    METRO_WALK_EVEN,       /* quasi-random: the points of an evenly filling sequence with two coordinates for each of
+                              the first 16 directions; the rest is random */
     METRO_WALK_METROPOLIS  /* by the chain of R4: importance is the luminance that a walk adds to the picture */
 } metro_walk;
 
@@ -1544,7 +1548,7 @@ typedef struct {
     metro_patches patches;
     double *share;                  /* [patches.count]: the share of the picture that shows the patch */
     uint64_t walks;                 /* made so far, all batches together */
-    uint64_t bundles, rays;         /* and what it took, the starts of chains included */
+    uint64_t bundles, rays;         /* and what it took, with the starts of chains and their draws for b */
     void *state;
 } metro_bundles;
 
@@ -1560,30 +1564,34 @@ typedef struct {
 } metro_bundles_report;
 
 /* Prepares to light `scene` by bundles and to show it as `camera` sees it; the scene is read during the runs and must
-   stay. Cuts the patches and finds by four rays a pixel how much of the picture shows each. Returns
-   METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses or options out of
-   range, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `bundles` is then unchanged. Memory:
-   for each batch 110 to 210 bytes a patch, three times as much where radiance is linear, and 600 a triangle. */
+   stay. Cuts the patches and finds by 6 x 6 rays a pixel how much of the picture shows each. Returns
+   METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses, options out of
+   range or a NULL, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `bundles` is then unchanged.
+   Cost: 36 rays a pixel on one thread. Memory: 150 bytes a patch; and for each batch 110 to 210 bytes a patch, three
+   times as much where radiance is linear, 450 a triangle, 4 a cell for METRO_FRAGMENTS and METRO_PAINTER, and 16 for
+   each patch on each line for METRO_FRAGMENTS. Source: paper, section 3.3. */
 METRO_API metro_result metro_bundles_make(const metro_scene *scene, const metro_camera *camera,
                                           const metro_bundles_options *options, metro_bundles *bundles);
 
 /* Makes `walks` more walks, rounded up to a multiple of the batches: each batch makes one in turn. After each such
    round `stop` (may be NULL) is asked; nonzero ends the run with METRO_ERROR_STOPPED. Returns
-   METRO_ERROR_NO_IMPORTANCE if no chain finds a state to start from, or METRO_ERROR_MEMORY; what is there so far
-   stands. The result depends on the options and the number of walks, not on the threads or on how the walks were
-   shared out over calls. Cost of a walk: depth - 1 bundles, one less after a first shot. */
+   METRO_ERROR_NO_IMPORTANCE if no chain finds a state to start from (then no later run does either),
+   METRO_ERROR_ARGUMENT for bundles that were not made, or METRO_ERROR_MEMORY; what is there so far stands. The result
+   depends on the options and the number of walks, not on the threads or on how the walks were shared out over calls.
+   Cost of a walk: depth - 1 bundles, one less after a first shot. Chains also make `candidates` walks each to start
+   from, or up to 64 times as many where light is rare, and without large steps one in sixteen for b. */
 METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
                                          int (*stop)(const metro_bundles *bundles, void *user), void *user);
 
 /* The radiance that each patch reflects to the eye, its own emission left out, and its standard error from the spread
    over the batches (may be NULL). Both have patches.count items. With Metropolis walks only patches that are in the
-   picture are right, since walks that light no other have no importance. Returns METRO_ERROR_ARGUMENT before the
-   first walk or for a NULL; the outputs are then unchanged. */
+   picture are right, since walks that light only others have no importance. Returns METRO_ERROR_ARGUMENT before the
+   first walk or for a NULL; the outputs are then unchanged. Cost: one step for each patch and batch. */
 METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error);
 
-/* Makes `image` and fills it with the picture so far, linear radiance: the last gathering, with 6 x 6 rays for each
-   pixel; lamps seen directly are added. Returns METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT before the first walk;
-   `image` is then unchanged. */
+/* Makes `image` and fills it with the picture so far, linear radiance: the final gathering, with 6 x 6 rays for each
+   pixel; lamps seen directly are added. Returns METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT before the first walk or
+   for a NULL; `image` is then unchanged. Cost: 36 rays a pixel, on all threads. */
 METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_image *image);
 
 /* Says how far the result so far can be believed. Never fails: before the first walk all is NaN or 0. */
@@ -14441,9 +14449,11 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
 
 /* # 14 Ray bundles
 
-   The methods so far follow one path at a time. Szirmay-Kalos and Purgathofer (1998) follow all parallel ones at
-   once: choose a direction at random, and move the radiance of every surface of the scene along it. Such a bundle is
-   dear, but it is coherent: neighbouring lines meet the same surfaces, so that what one line learns serves the next.
+   The methods so far follow one path at a time. Lines that cross the whole scene, each of which moves light between
+   all that it meets, came to radiosity with Sbert (1993) and Neumann (1995), who takes them in parallel bundles.
+   Szirmay-Kalos and Purgathofer (1998) make walks of such bundles: choose a direction at random, and move the
+   radiance of every surface of the scene along it. Such a bundle is dear, but it is coherent: neighbouring lines meet
+   the same surfaces, so that what one line learns serves the next.
 
    [figure: fig6.svg | A path of ray bundles, drawn from a walk (figure 6 of the paper).]
 
@@ -14588,14 +14598,15 @@ METRO_API size_t metro_patches_at(const metro_patches *patches, uint32_t triangl
 /* # 14.2 A bundle
 
    We look along the direction omega. In a frame of three axes with omega for the third, a point has the coordinates x
-   and y, counted in cells of the grid, and its depth z. The sphere around the scene covers the grid from any side,
+   and y, counted in cells of the grid, and its depth z. The grid covers the sphere around the scene from any side,
    and the grid is shifted by a random part of a cell: then each line is uniform, and any count of lines is right in
    the mean. This is what keeps patches smaller than a cell unbiased, as long as what a patch received is divided by
    its true area and not by the lines that happened to meet it:
 
        E[c^2 sum_{"lines"} L_j] = sum_{j} A(i, j) L_j                                 (14.3)
 
-   with $c$ the side of a cell. A patch i receives from one side only, its front, and a line has two directions:
+   with $c$ the side of a cell. The variance pays for it: a patch much smaller than a cell is met seldom, and then
+   receives much at once. A patch i receives from one side only, its front, and a line has two directions:
    if omega is uniform on the sphere, the direction from which a patch receives is uniform on a hemisphere, with the
    density 1/(2 pi). So one bundle estimates the integral of eq 14.1 by
 
@@ -14652,7 +14663,7 @@ METROI_INLINE double metroi_lines_before(double x)
    two triangles share is cut at the same x for both, to the bit. */
 
 typedef struct {
-    double x0, y0, x1, y1, y2;        /* corners 0 and 1, and how far down the last one is */
+    double x0, y0, x1, y1;            /* corners 0 and 1 */
     double slope01, slope12, slope02; /* dx/dy of the edges */
     double depth, depth_x, depth_y;   /* z = depth + depth_x (x - x0) + depth_y (y - y0) */
     int32_t row, row_end;
@@ -14692,7 +14703,6 @@ static metroi_outline metroi_outline_make(metro_vec3 a, metro_vec3 b, metro_vec3
     o.y0 = a.y;
     o.x1 = b.x;
     o.y1 = b.y;
-    o.y2 = c.y;
     o.slope02 = c.y > a.y ? ac.x / ac.y : 0;
     o.slope01 = b.y > a.y ? ab.x / ab.y : 0;
     o.slope12 = c.y > b.y ? (c.x - b.x) / (c.y - b.y) : 0;
@@ -14738,6 +14748,9 @@ METROI_INLINE int metroi_comes_first(double depth_a, int up_a, size_t a, double 
    whole stretch of lines, and all that is left is to see which of their patches do.
 
    Sorting patches instead of triangles would repeat for every patch what is the same for all patches of a triangle.
+   Two spans are compared once, in the middle of what they have in common, which is enough where surfaces at most
+   touch. Where triangles pass through each other the sweep takes one of them for the upper one all along, and two
+   squares that cross may be off by a tenth; such scenes are for the fragments of section 14.4.
 
    Along the stretch the patch of a triangle changes where $s$, $t$ or $s + t$ of eq 14.2 passes a whole number. That
    gives three arithmetic sequences of places, and their merging is simple: a patch with k = 0 is left into one with
@@ -15289,12 +15302,12 @@ static void metroi_fragments(metroi_bundle *bundle)
 
 /* # 14.5 Painting
 
-   In 1998 a bundle was painted by graphics hardware: patches in the order of their depth, each over what is there.
-   The picture holds at each cell the number of the last patch that was painted there, which is the neighbour of the
-   next one (Szirmay-Kalos and Purgathofer 1998). But whole patches have no order. Two that are near each other may be
-   painted in the order of their centres although one reaches before the other; and what is then exchanged between the
-   wrong pairs is the same on the finest grid and with any number of bundles. The sweep above is exact, and
-   faster where triangles have many patches.
+   In 1998 bundles were also painted: patches in the order of their depth, each over what is there (the global
+   painter's algorithm of Szirmay-Kalos 1998a). The picture holds at each cell the number of the last patch that was
+   painted there, which is the neighbour of the next one. But whole patches have no order. Two that are near each
+   other may be painted in the order of their centres although one reaches before the other; and what is then
+   exchanged between the wrong pairs is the same on the finest grid and with any number of bundles. The sweep above
+   has no such error, and is faster where triangles have many patches, as the chart shows.
 
    [figure: painter.svg | The painter's error does not fall with the grid: what patches receive by all ways of
    sections 14.3 to 14.6.]
@@ -15368,8 +15381,7 @@ static void metroi_painter(metroi_bundle *bundle)
    Let the lines of a row come ever closer. In the limit a row is no longer a comb of lines but a strip of light, and
    the lines that two patches share become a length. Nothing in the sweep counts lines: it exchanges stretches, and
    their ends need not be rounded. So the same code is exact along the row, and only the rows are samples
-   (Szirmay-Kalos, Foris and Purgathofer 1998 take the limit in both directions by an analytic visibility, at a much
-   higher price). */
+   (Szirmay-Kalos, Foris and Purgathofer 1998c take the limit in both directions by an analytic visibility). */
 
 static void metroi_sweep_lines(metroi_bundle *bundle)
 {
@@ -15491,7 +15503,8 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
     metro_result result;
     double cell;
     size_t i;
-    if (patches == NULL || radiance == NULL || received == NULL) return METRO_ERROR_ARGUMENT;
+    if (patches == NULL || patches->scene == NULL) return METRO_ERROR_ARGUMENT;
+    if (radiance == NULL || received == NULL) return METRO_ERROR_ARGUMENT;
     if (grid < 1 || grid > METROI_GRID_MOST || isnan(metro_normalize(direction).x)) return METRO_ERROR_ARGUMENT;
     if (visibility < METRO_SWEEP || visibility > METRO_LINES) return METRO_ERROR_ARGUMENT;
     if (shift == NULL) shift = none;
@@ -15550,6 +15563,7 @@ typedef struct {
     uint64_t key;
     uint64_t rounds;         /* made so far, of one walk a batch */
     uint64_t at_once;        /* how many a batch makes before it waits for the others */
+    int started;             /* the chains are */
     size_t alive;            /* chains that found a start */
     metro_bundles *shown;    /* whose numbers grow, and whom to ask whether to stop */
     int (*stop)(const metro_bundles *bundles, void *user);
@@ -15674,8 +15688,9 @@ static void metroi_walk_show(metroi_batch *batch, const metro_vec3 *in, double *
 /* # 14.8 The first shot
 
    Light that comes straight from a lamp is the hardest for bundles: a small lamp is met by few lines, and the patches
-   that it lights brightly differ from walk to walk. Shadow rays do it better (the first shot of Szirmay-Kalos and
-   Purgathofer 1998): in each walk one ray goes from a random point p of each patch to a random point y of a lamp, and
+   that it lights brightly differ from walk to walk. Shadow rays do it better: Szirmay-Kalos and Purgathofer (1998)
+   shoot the light of point lamps beforehand. Ours have an area: in each walk one ray goes from a random point p of
+   each patch to a random point y of a lamp, and
 
        H_i = frac{L^e cos(theta_p) cos(theta_y)}{d^2 p_A} V(p, y)                     (14.9)
 
@@ -15754,8 +15769,9 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
        h_b(n_1 + n_2 b + n_3 b^2 + ...) = frac{n_1}{b} + frac{n_2}{b^2} + frac{n_3}{b^3} + ...               (14.10)
 
    But then every other point has the first coordinate of the one before it, plus 1/2: neighbours avoid each other.
-   The second direction of a walk is never near the first, however many walks are made, and the products of eq 14.8
-   are integrated over a part of the space only. The picture converges, and it is wrong. A random shift of the whole
+   The pairs of two directions lie on a few lines of the square of their coordinates and do not fill it, however many
+   walks are made, so the products of eq 14.8 are integrated over a part of the space only. The picture converges, and
+   it is wrong. A random shift of the whole
    sequence, modulo 1, makes the batches independent and does not help.
 
    [figure: runon.svg | A sequence that runs on converges to a wrong answer: error against walks.] */
@@ -15818,8 +15834,9 @@ static void metroi_walk_draw(metroi_bundles *plan, size_t index, uint64_t round)
    A mutation perturbs all directions inside a cone, or one of them; the grids move by up to as much as the rim of the
    scene does. What a state adds to the sums is its contribution over I, and the sums are scaled by b (eq 4.1).
 
-   Only where radiance is linear can the sum be below 0. A bundle serves the whole picture at once, so the integrand
-   is smoother than that of single paths, and the paper concludes that Metropolis sampling gains less by it.
+   Only where radiance is linear can the sum be below 0; then I passes 0 where the contribution does not, f/I has no
+   bound, and Metropolis walks are better left to constant radiance. A bundle serves the whole picture at once, so the
+   integrand is smoother than that of single paths, and the paper concludes that Metropolis sampling gains less by it.
 
    [figure: fig8.svg | Error against walks: Metropolis walks with several sizes, random and even walks (figure 8 of
    the paper).] */
@@ -15953,11 +15970,14 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
 
 /* # 14.11 The picture
 
-   The last step is a gathering: through each pixel go 6 x 6 rays, and each sees the radiance of the patch that it
-   meets. The share v_i of a patch in the picture is what such rays find, with four for each pixel.
+   The last step is a final gathering: through each pixel go 6 x 6 rays, and each sees the radiance of the patch that
+   it meets. The share v_i of a patch in the picture is what the same rays find, so that no patch is seen whose light
+   a chain does not look for.
 
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
+
+enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
 
 /* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
    none. */
@@ -15973,13 +15993,15 @@ static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
-    size_t width = 2 * plan->options.width, height = 2 * plan->options.height, x, y;
+    size_t width = METROI_GATHER_SIDE * plan->options.width, height = METROI_GATHER_SIDE * plan->options.height, x, y;
     metro_hit hit;
     for (y = 0; y < height; y++)
         for (x = 0; x < width; x++) {
-            size_t patch = metroi_bundles_look(plan, 0.5 * ((double)x + 0.5), 0.5 * ((double)y + 0.5), &hit);
-            if (patch < plan->patches.count) share[patch] += 1 / ((double)width * (double)height);
+            size_t patch = metroi_bundles_look(plan, ((double)x + 0.5) / METROI_GATHER_SIDE,
+                                               ((double)y + 0.5) / METROI_GATHER_SIDE, &hit);
+            if (patch < plan->patches.count) share[patch] += 1;
         }
+    for (x = 0; x < plan->patches.count; x++) share[x] /= (double)width * (double)height;
 }
 
 static void metroi_bundles_free(metroi_bundles *plan)
@@ -16049,7 +16071,8 @@ static metro_result metroi_bundles_check(const metro_scene *scene, const metro_c
 }
 
 /* A patch is six cells long unless the options say otherwise: a coarse grid with many walks is worth more than a fine
-   one with few. After a first shot what is left to move comes from everywhere, and three cells do. */
+   one with few. After a first shot what is left to move comes from everywhere, and three cells do, where patches are
+   not much narrower than long. */
 
 static metro_result metroi_bundles_cut(metro_bundles *bundles)
 {
@@ -16141,6 +16164,7 @@ METRO_API metro_result metro_bundles_make(const metro_scene *scene, const metro_
     metro_bundles made;
     metroi_bundles *plan = NULL;
     metro_result result;
+    if (bundles == NULL) return METRO_ERROR_ARGUMENT;
     memset(&made, 0, sizeof made);
     made.scene = scene;
     made.options = metroi_bundles_defaults(options);
@@ -16157,8 +16181,8 @@ METRO_API metro_result metro_bundles_make(const metro_scene *scene, const metro_
     return result;
 }
 
-/* A job is a batch. It makes one walk and waits for the others, so that somebody can ask whether to stop; where nobody
-   does it makes all its walks, and no thread waits but at the end. */
+/* A job is a batch. It makes one walk and waits for the others, so that somebody can ask whether to stop; where
+   nobody does it makes all its walks, and no thread waits but at the end. */
 
 static metro_result metroi_bundles_work(uint64_t job, void *slot, void *user)
 {
@@ -16200,21 +16224,22 @@ static metro_result metroi_bundles_start(metroi_bundles *plan)
     result = metro_rounds_run(&rounds, plan);
     if (result != METRO_OK) return result;
     for (plan->alive = i = 0; i < plan->options.batches; i++) plan->alive += plan->batch[i].alive ? 1u : 0u;
-    return plan->alive > 0 ? METRO_OK : METRO_ERROR_NO_IMPORTANCE;
+    return METRO_OK;
 }
 
 METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
                                          int (*stop)(const metro_bundles *bundles, void *user), void *user)
 {
-    metroi_bundles *plan = (metroi_bundles *)bundles->state;
+    metroi_bundles *plan = bundles != NULL ? (metroi_bundles *)bundles->state : NULL;
     metro_rounds rounds;
-    metro_result result;
     if (plan == NULL) return METRO_ERROR_ARGUMENT;
     if (walks == 0) return METRO_OK;
-    if (plan->options.walk == METRO_WALK_METROPOLIS && plan->alive == 0) {
-        result = metroi_bundles_start(plan);
+    if (plan->options.walk == METRO_WALK_METROPOLIS && !plan->started) {
+        metro_result result = metroi_bundles_start(plan);
         if (result != METRO_OK) return result;
+        plan->started = 1;
     }
+    if (plan->options.walk == METRO_WALK_METROPOLIS && plan->alive == 0) return METRO_ERROR_NO_IMPORTANCE;
     plan->shown = bundles;
     plan->stop = stop;
     plan->user = user;
@@ -16304,7 +16329,7 @@ static void metroi_bundles_numbers(const metroi_bundles *plan, size_t values, si
 
 METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error)
 {
-    const metroi_bundles *plan = (const metroi_bundles *)bundles->state;
+    const metroi_bundles *plan = bundles != NULL ? (const metroi_bundles *)bundles->state : NULL;
     if (plan == NULL || plan->rounds == 0 || radiance == NULL) return METRO_ERROR_ARGUMENT;
     metroi_bundles_numbers(plan, plan->patches.count, plan->options.linear ? 3 : 1, radiance, error);
     return METRO_OK;
@@ -16317,8 +16342,6 @@ typedef struct {
     const metro_vec3 *radiance; /* of all values of the patches */
     metro_image *image;
 } metroi_gather;
-
-enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
 
 /* The radiance at a hit of a patch: that of the patch, or linear between its corners. */
 
@@ -16368,7 +16391,7 @@ static metro_result metroi_gather_work(uint64_t job, void *slot, void *user)
 
 METRO_API metro_result metro_bundles_image(const metro_bundles *bundles, metro_image *image)
 {
-    const metroi_bundles *plan = (const metroi_bundles *)bundles->state;
+    const metroi_bundles *plan = bundles != NULL ? (const metroi_bundles *)bundles->state : NULL;
     metroi_gather gather;
     metro_rounds rounds;
     metro_image made;
@@ -16531,7 +16554,10 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
    | L(omega), L^e | the radiances of all patches, their emission | `metro_bundle_transfer` |
    | F(omega', omega) | the BRDFs of all patches | `metro_brdf` |
    | A(i, j, omega') | the projected area of patch j that patch i sees | `metro_bundle_transfer` |
-   | D | the directions of a walk of bundles | `metro_bundles_options.depth` less 1 |
+   | D | the directions of a walk of bundles | `metro_bundles_options.depth` less 1, less 2 after a first shot |
+   | c | the side of a cell of the grid | `1 / metroi_rays.per_cell` |
+   | v_i | the share of the picture that shows patch i | `metro_bundles.share` |
+   | H_i | the irradiance of patch i by the first shot | `metroi_batch.lit` |
 
    # C License
 
