@@ -1,7 +1,7 @@
 # metro.h: everything is built with cc and make.
 #
 #   make            the examples, into build/
-#   make paper      every figure, chart and table of the paper, into out/ (QUICK=1: a small version within a minute)
+#   make paper      every figure, chart and table of the paper, into out/ (QUICK=1: a small version, in a minute)
 #   make test       the tests; ends with one line "N passed, N failed"
 #   make docs       the book, into out/book/, with the checks of its prose
 #   make check      the tests again under every compiler, sanitizer, emulator and fuzzer that is installed

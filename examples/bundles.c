@@ -301,7 +301,7 @@ static int show_transfers(const metro_scene *scene, char *title, size_t size)
                                  "way,patches,grid,ms,ms_se,spread,spread_se,bias2,bias2_se");
     plot_chart chart = transfer_sheet();
     size_t k, last;
-    double bias2, painter, sweep;
+    double bias2, error, painter, sweep;
     int failed;
     for (k = 0; k < SIZES; k++) {
         if (transfer_run(scene, count[k], &t[k]) != 0) return 1;
@@ -314,13 +314,14 @@ static int show_transfers(const metro_scene *scene, char *title, size_t size)
     }
     last = t[1].shown - 1;
     bias2 = metro_moments_mean(&t[1].bias2[METRO_PAINTER][last]);
+    error = root_error(bias2, metro_moments_error(&t[1].bias2[METRO_PAINTER][last]));
     painter = metro_moments_mean(&t[1].seconds[METRO_PAINTER][last]);
     sweep = metro_moments_mean(&t[1].seconds[METRO_SWEEP][last]);
     snprintf(title, size,
-             "No grid removes the painter's bias: %.2g (+- %.1g) of what is received, on %d x %d cells; the exact "
-             "sweep takes %.2g times its time",
-             root_of(bias2), root_error(bias2, metro_moments_error(&t[1].bias2[METRO_PAINTER][last])),
-             (int)grid_of(last), (int)grid_of(last), sweep / painter);
+             "%s painter's bias: %.2g (+- %.1g) of what is received, on %d x %d cells; the exact sweep takes %.2g "
+             "times its time",
+             root_of(bias2) > 3 * error ? "No grid removes the" : "Too few directions to tell the", root_of(bias2),
+             error, (int)grid_of(last), (int)grid_of(last), sweep / painter);
     chart.title = title;
     chart.note = "The Cornell box; each patch sends out a random color. Mean over directions; bars are standard "
                  "errors. The fragments give what the sweep gives. Dotted: two standard errors above the bias of "
@@ -736,8 +737,9 @@ static int show_patches(char *title, size_t size)
         progress(0.55 + 0.15 * (double)(k + 1));
     }
     snprintf(title, size,
-             "Smaller patches come closer to the truth: %.0f by relMSE %.2g, and %.2g if radiance is linear on each; "
-             "behind the door the picture is then %.2f (+- %.2f) and %.2f (+- %.2f) times as bright",
+             "In the Cornell box smaller patches come closer to the truth: %.0f by relMSE %.2g, and %.2g if radiance "
+             "is linear; behind the door the picture is still %.2f (+- %.2f) and %.2f (+- %.2f) times as bright as "
+             "paths make it",
              r[0].patches[r[0].shown - 1], last[0][0].relmse, last[0][1].relmse, last[1][0].mean, last[1][0].mean_se,
              last[1][1].mean, last[1][1].mean_se);
     chart.title = title;

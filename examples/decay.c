@@ -1,5 +1,5 @@
 /* decay.c: how fast is the start forgotten? Section 2 of the paper answers for a constant importance on a circle;
-   on the sphere of directions the answer is the spectrum of the cone (section 5.17): what is left of degree l
+   on the sphere of directions the answer is the spectrum of the cone (section 5.18): what is left of degree l
    after n mutations is lambda_l^n, and lambda_1 = cos^2(apex / 4) is the slowest.
 
    - One direction in a furnace, a closed box whose walls all emit the same: what arrives in its middle is the same
@@ -590,7 +590,7 @@ int main(void)
     };
     static picture truth;
     rate rates[ROOMS][ANGLES], path_rate[ANGLES];
-    double worst = 0, best = 0, ratio[2] = { 0, 0 }, fitted = 0;
+    double worst = 0, best = 0, ratio[2] = { 0, 0 }, paths = 0, fitted = 0;
     char title[160];
     plot_chart chart = sheet();
     plot_csv csv = plot_csv_open("out/decay.csv", "what,apex,n,value,error,theory");
@@ -610,12 +610,12 @@ int main(void)
                    (double)NAN);
         write_down(&csv, "Cornell box: rate of paths", path_angle[a], 1, path_rate[a].value, path_rate[a].error,
                    (double)NAN);
-        ratio[0] += rates[CORNELL][a].value / -log(lambda_1(angle[a])) / ANGLES;
+        if (a == 0 || a == ANGLES - 1) ratio[a > 0] = rates[CORNELL][a].value / -log(lambda_1(angle[a]));
         if (isnan(path_rate[a].value)) continue; /* too little bias is left for a fit */
-        ratio[1] += path_rate[a].value / -log(lambda_1(path_angle[a]));
+        paths += path_rate[a].value / -log(lambda_1(path_angle[a]));
         fitted++;
     }
-    ratio[1] /= fitted;
+    paths /= fitted;
     plot_progress(0.7, "decay");
     draw_rates(&chart.panel[2], rooms[CORNELL].scene.camera.fov * pi / 180, rates[FURNACE], rates[CORNELL],
                path_rate);
@@ -634,9 +634,9 @@ int main(void)
                rates[CORNELL][a].error, path_angle[a], path_rate[a].value, path_rate[a].error);
     printf(
         "the furnace is off the theory by %.1f standard errors at most; in the Cornell box one direction forgets at "
-        "%.2g times the predicted rate, a path's picture at %.2g times; the best apex angle there is about %.2g "
-        "rad\n",
-        worst, ratio[0], ratio[1], best);
+        "%.2g times the predicted rate at %g rad and %.2g times at %g, a path's picture at %.2g times; the best apex "
+        "angle there is about %.2g rad\n",
+        worst, ratio[0], angle[0], ratio[1], angle[ANGLES - 1], paths, best);
     for (r = 0; r < ROOMS; r++) metro_scene_free(&rooms[r].scene);
     return 0;
 }

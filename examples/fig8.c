@@ -342,7 +342,7 @@ static int draw(const figure *f, const curve *curves)
     char title[240], note[400];
     double random = curves[RANDOM].at[last].error.value, metropolis = curves[best].at[last].error.value;
     snprintf(title, sizeof title,
-             "Ray bundles behind a door: after %d walks Metropolis is off by %.2f at best (%g rad), random walks by "
+             "Ray bundles in a glossy room behind a door: after %d walks Metropolis is off by %.2f at best (%g rad), random walks by "
              "%.2f, even ones by %.2f",
              (int)look[last], metropolis, curves[best].perturbation, random, curves[EVEN].at[last].error.value);
     snprintf(note, sizeof note,

@@ -31,7 +31,7 @@ enum { PATH, BDPT, MLT, PSSMLT, RANDOM, SHOT, EVEN, METROPOLIS, METHODS };
 static const char *const name_of[METHODS] = { "path tracing", "bidirectional", "MLT .3 rad", "primary space",
                                               "bundles, plain", "bundles, first shot", "even bundles",
                                               "Metropolis bundles" };
-static const char *const scene_name[SCENES] = { "Cornell box", "hidden lamp" };
+static const char *const scene_name[SCENES] = { "Cornell box", "lamp behind a door" };
 static const char *const scene_path[SCENES] = { "examples/scenes/cornell.obj", "examples/scenes/hidden.obj" };
 
 typedef struct {
