@@ -13248,7 +13248,7 @@ static metro_result metroi_path_work(uint64_t job, void *slot, void *user)
     const metroi_path_plan *plan = (const metroi_path_plan *)user;
     metroi_log *log = (metroi_log *)slot;
     size_t all = plan->canvas->width * plan->canvas->height, first = (size_t)(job % plan->jobs) * METROI_JOB_PIXELS;
-    size_t pixels = first >= all ? 0 : all - first < METROI_JOB_PIXELS ? all - first : METROI_JOB_PIXELS;
+    size_t left = first < all ? all - first : 0, pixels = left < METROI_JOB_PIXELS ? left : (size_t)METROI_JOB_PIXELS;
     size_t members = (size_t)plan->tracer.eye_walks, groups = pixels / members, group, k, i;
     metro_rng rng = metro_rng_make(plan->key, job);
     metroi_sample *sample = (metroi_sample *)METRO_MALLOC(metroi_sample_size(&plan->tracer));
@@ -15993,12 +15993,13 @@ static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
-    size_t width = METROI_GATHER_SIDE * plan->options.width, height = METROI_GATHER_SIDE * plan->options.height, x, y;
+    const size_t side = METROI_GATHER_SIDE, width = side * plan->options.width, height = side * plan->options.height;
+    size_t x, y;
     metro_hit hit;
     for (y = 0; y < height; y++)
         for (x = 0; x < width; x++) {
-            size_t patch = metroi_bundles_look(plan, ((double)x + 0.5) / METROI_GATHER_SIDE,
-                                               ((double)y + 0.5) / METROI_GATHER_SIDE, &hit);
+            double px = ((double)x + 0.5) / (double)side, py = ((double)y + 0.5) / (double)side;
+            size_t patch = metroi_bundles_look(plan, px, py, &hit);
             if (patch < plan->patches.count) share[patch] += 1;
         }
     for (x = 0; x < plan->patches.count; x++) share[x] /= (double)width * (double)height;
