@@ -1,16 +1,16 @@
-/* colours.c: a lesson on the scalar importance. A path carries red, green and blue, but a chain knows one number; which
-   one is the user's choice (section 1 of the paper: it "can, for example, represent the luminance"). Luminance gives
-   red a weight of .21, green .72 and blue .07, so a path that carries blue alone seems unimportant, is seldom visited
-   and then counts fourteen times in blue. With the largest of the three channels as the importance no path counts more
-   than once in any of them.
+/* colours.c: a lesson on the scalar importance. A path carries red, green and blue, but a chain knows one number;
+   which one is the user's choice (section 1 of the paper: it "can, for example, represent the luminance"). Luminance
+   gives red a weight of .21, green .72 and blue .07, so a path that carries blue alone seems unimportant, is seldom
+   visited and then counts fourteen times in blue. With the largest of the three channels as the importance no path
+   counts more than once in any of them.
 
    Two scenes: a white room under a red, a green and a blue lamp, made here, in which each path has one color; and the
    Cornell box under its yellowish lamp. Each is painted many times by chains with either importance. The bars are the
    relative errors of each color channel: its own RMSE over its own root mean square.
 
-   See: with pure colors, luminance makes green good and blue bad, and the largest channel makes all three alike; in the
-   two pictures it is the right side that gains. Where all paths carry all colors, as nearly all do in the Cornell box,
-   the choice hardly matters.
+   See: with pure colors, luminance makes green good and blue bad, and the largest channel makes all three alike; in
+   the two pictures it is the right side that gains. Where all paths carry all colors, as nearly all do in the Cornell
+   box, the choice hardly matters.
 
    Writes out/colours.svg and out/colours.csv. */
 #define METRO_IMPLEMENTATION

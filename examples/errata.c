@@ -80,7 +80,8 @@ static double ring_share(const double target[5], int right_way)
 static void algorithm(void)
 {
     static const double target[5] = { 0.05, 0.1, 0.15, 0.2, 0.5 };
-    row("section_1.1", "share of the last of five states", ring_share(target, 0), ring_share(target, 1), target[4], 1e-12);
+    row("section_1.1", "share of the last of five states", ring_share(target, 0), ring_share(target, 1), target[4],
+        1e-12);
 }
 
 /* Paper (3): Int p_n(y) P(x -> y) dy. A kernel that drifts to the right by .02 on average; where is it after ten
@@ -95,7 +96,8 @@ static void direction(void)
         for (i = 0; i < 10; i++) x += 0.02 + 0.1 * (metro_rng_uniform(&rng) - 0.5);
         metro_moments_add(&m, x);
     }
-    row("paper_3", "mean place after ten steps of drift .02", -0.2, 0.2, metro_moments_mean(&m), metro_moments_error(&m));
+    row("paper_3", "mean place after ten steps of drift .02", -0.2, 0.2, metro_moments_mean(&m),
+        metro_moments_error(&m));
 }
 
 /* Paper (12) on a period of 2 pi: three steps of width 1. The density is then the quadratic B-spline, whose square
@@ -138,8 +140,8 @@ static void seeds(void)
             for (wrap = -1; wrap <= 1; wrap++) density += alpha[j] * spline((x - seed[j] + wrap) / 0.3) / 0.3;
         truth += density * density / GRID;
     }
-    row("paper_15", "E_3 from three seeds; width .3", sqrt(printed), metro_startup_error_seeds(&kernel, N, seed, alpha, 3),
-        sqrt(truth), 1e-8);
+    row("paper_15", "E_3 from three seeds; width .3", sqrt(printed),
+        metro_startup_error_seeds(&kernel, N, seed, alpha, 3), sqrt(truth), 1e-8);
 }
 
 /* Paper (16): the density of the uniform perturbation, summed over the circle. */

@@ -4,12 +4,12 @@
    factor cos(theta'_k) cos(theta_{n-k+1})/r_k^2, or everything when something stands between.
 
    The other points can be joined as well, and then two short walks make six paths at once, of one to four reflections
-   (Lafortune and Willems 1993). Chapter 12 also joins the points of the shooting walk with the eye; these joins are not
-   drawn here.
+   (Lafortune and Willems 1993). Chapter 12 also joins the points of the shooting walk with the eye; these joins are
+   not drawn here.
 
    The walks are made with the same few functions that a renderer of one's own would use: see `follow`, `gather`,
-   `shoot` and `joined`. The rest is drawing: a parallel projection of the box from its right side, whose walls are seen
-   through from behind.
+   `shoot` and `joined`. The rest is drawing: a parallel projection of the box from its right side, whose walls are
+   seen through from behind.
 
    Writes out/fig3.svg and out/fig3.csv (all joins). */
 #define METRO_IMPLEMENTATION
@@ -136,7 +136,7 @@ static spot on_paper(const drawing *d, metro_vec3 point)
     return s;
 }
 
-/* Depth goes into the room along the view of the camera, and the right side of the room comes forward on the paper. */
+/* Depth goes into the room along the view of the camera, and the right side of the room comes forward. */
 static void set_up(drawing *d, const metro_scene *scene, double width, double top, double height)
 {
     const metro_camera *camera = &scene->camera;

@@ -8,9 +8,9 @@
    remembers only by rejecting; and bidirectional path tracing, whose samples are independent and suit the surfaces.
 
    See: all curves fall like the root of the number of samples, sooner or later, so what a perturbation costs is the
-   distance between them. The smallest angle is worst, a middle one is best, and wide ones lose what the chain has found
-   ("forgets which regions are important", section 2.3). On a scene as plain as this no Metropolis curve comes near
-   bidirectional path tracing: the conclusion of the paper.
+   distance between them. The smallest angle is worst, a middle one is best, and wide ones lose what the chain has
+   found ("forgets which regions are important", section 2.3). On a scene as plain as this no Metropolis curve comes
+   near bidirectional path tracing: the conclusion of the paper.
 
    Writes out/fig4.svg, out/fig4.csv, and the reference as out/fig4_reference.png and out/fig4_reference.pfm. */
 #define METRO_IMPLEMENTATION

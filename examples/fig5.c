@@ -1,11 +1,11 @@
-/* fig5.c: the paper's figure 5 (section 3.2): pictures of the Cornell box by 20, 80 and 320 samples per pixel (left to
-   right), with apex angles of the perturbation of .05, .15 and .45 rad (top to bottom). The runs are those of figure 4:
-   one chain for each picture, no large steps, light straight from the lamp left out.
+/* fig5.c: the paper's figure 5 (section 3.2): pictures of the Cornell box by 20, 80 and 320 samples per pixel (left
+   to right), with apex angles of the perturbation of .05, .15 and .45 rad (top to bottom). The runs are those of
+   figure 4: one chain for each picture, no large steps, light straight from the lamp left out.
 
-   See: "incorrect bright and dark spots" at the small angle, fine grain at the large one. Two numbers tell them apart:
-   the error of the pixels, and the error of the means of 8 x 8 pixels, the spots. Noise that is independent from pixel
-   to pixel would be eight times smaller in such a mean; spots survive it. What a spot is made of - the start, or just
-   neighbours in the chain that look alike - one picture cannot say: bias.c takes them apart.
+   See: "incorrect bright and dark spots" at the small angle, fine grain at the large one. Two numbers tell them
+   apart: the error of the pixels, and the error of the means of 8 x 8 pixels, the spots. Noise that is independent
+   from pixel to pixel would be eight times smaller in such a mean; spots survive it. What a spot is made of - the
+   start, or just neighbours in the chain that look alike - one picture cannot say: bias.c takes them apart.
 
    Writes out/fig5.svg (the sheet with its numbers), out/fig5.png (the nine pictures alone) and out/fig5.csv. */
 #define METRO_IMPLEMENTATION

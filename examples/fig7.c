@@ -83,7 +83,8 @@ static int draw(exhibit *e, const metro_image *reference, double exposure, size_
 {
     plot_chart chart = plot_chart_make(NULL, NULL);
     char title[200], note[240];
-    snprintf(title, sizeof title, "A glossy room, its lamp behind a door: bundles trade grain for patches, error %.2f against %.2f",
+    snprintf(title, sizeof title,
+             "A glossy room, its lamp behind a door: bundles trade grain for patches, error %.2f against %.2f",
              e[0].error.relative_rmse, e[1].error.relative_rmse);
     snprintf(note, sizeof note,
              "%d x %d pixels, paths of up to 8 edges. Seconds of computing, all threads together. Error: "

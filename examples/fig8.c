@@ -342,13 +342,13 @@ static int draw(const figure *f, const curve *curves)
     char title[240], note[400];
     double random = curves[RANDOM].at[last].error.value, metropolis = curves[best].at[last].error.value;
     snprintf(title, sizeof title,
-             "Ray bundles in a glossy room behind a door: after %d walks Metropolis is off by %.2f at best (%g rad), random walks by "
-             "%.2f, even ones by %.2f",
+             "Ray bundles in a glossy room behind a door: after %d walks Metropolis is off by %.2f at best (%g rad), "
+             "random walks by %.2f, even ones by %.2f",
              (int)look[last], metropolis, curves[best].perturbation, random, curves[EVEN].at[last].error.value);
     snprintf(note, sizeof note,
              "Relative error of the reflected light of the %d patches seen, median of %d runs; half of them lie in "
              "the band. Walks of 7 bundles. A Metropolis run has two chains from fixed points and perturbs all "
-             "directions, dashed: one.",
+             "directions at once (solid) or one of them (dashed).",
              (int)f->visible, (int)f->runs);
     chart.title = title;
     chart.note = note;

@@ -59,8 +59,8 @@ LIGHT_API metro_result light_render(const metro_scene *scene, const metro_render
     return result;
 }
 
-/* The picture that `options` estimate (size, depth, shortest), by bidirectional path tracing in two independent halves
-   of `rounds` rounds each. `noise` is the relative RMSE of what comes out, from what the halves differ by. */
+/* The picture that `options` estimate (size, depth, shortest), by bidirectional path tracing in two independent
+   halves of `rounds` rounds each. `noise` is the relative RMSE of what comes out, from what the halves differ by. */
 LIGHT_API metro_result light_reference(const metro_scene *scene, const metro_render_options *options, uint64_t rounds,
                                        metro_image *image, double *noise)
 {
@@ -100,7 +100,7 @@ typedef struct {
     size_t looks, repeats;
     double *picture;              /* [looks * repeats * values], by the function; values = 3 * width * height */
     metro_render_report *report;  /* [repeats], after the last look */
-    double *seconds;              /* [looks * repeats]: computing time until each look, all that comes before included */
+    double *seconds;              /* [looks * repeats]: computing time until each look, with all that comes before */
 } light_study;
 
 LIGHT_API size_t light_study_values(const light_study *study)
@@ -187,7 +187,8 @@ LIGHT_API metro_result light_study_run(light_study *study)
     plan.slot_size = (sizeof(metro_render_report) + 15) / 16 * 16 + study->looks * (values + 1) * sizeof(double);
     plan.work = light_study_work;
     plan.merge = light_study_merge;
-    if (study->picture != NULL && study->report != NULL && study->seconds != NULL) result = metro_rounds_run(&plan, study);
+    if (study->picture != NULL && study->report != NULL && study->seconds != NULL)
+        result = metro_rounds_run(&plan, study);
     if (result != METRO_OK) light_study_free(study);
     return result;
 }
@@ -219,8 +220,8 @@ LIGHT_API void light_luminance(const double *color, size_t pixels, double *lumin
     for (i = 0; i < pixels; i++) luminance[i] = metro_luminance(color[3 * i], color[3 * i + 1], color[3 * i + 2]);
 }
 
-/* Sets mask[pixel] to 0 where a lamp is seen in the pixel or in one beside it, else to 1; returns how many are 1. Beside
-   a lamp the picture has a spike that no number of samples smooths, which studies of bias leave out. */
+/* Sets mask[pixel] to 0 where a lamp is seen in the pixel or in one beside it, else to 1; returns how many are 1.
+   Beside a lamp the picture has a spike that no number of samples smooths, which studies of bias leave out. */
 LIGHT_API size_t light_mask(const metro_scene *scene, size_t width, size_t height, unsigned char *mask)
 {
     enum { FINE = 8 };
@@ -236,7 +237,8 @@ LIGHT_API size_t light_mask(const metro_scene *scene, size_t width, size_t heigh
         if (!(material->ke.x + material->ke.y + material->ke.z > 0)) continue;
         if (!(metro_dot(metro_scene_normal(scene, hit.triangle), direction) < 0)) continue;
         for (y = (size_t)fy > 0 ? (size_t)fy - 1 : 0; y <= (size_t)fy + 1 && y < height; y++)
-            for (x = (size_t)fx > 0 ? (size_t)fx - 1 : 0; x <= (size_t)fx + 1 && x < width; x++) mask[y * width + x] = 0;
+            for (x = (size_t)fx > 0 ? (size_t)fx - 1 : 0; x <= (size_t)fx + 1 && x < width; x++)
+                mask[y * width + x] = 0;
     }
     for (i = 0; i < width * height; i++) used += mask[i];
     return used;

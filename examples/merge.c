@@ -162,7 +162,8 @@ static int check_same(const share_list *list)
     size_t i;
     for (i = 1; i < list->count; i++) {
         if (list->item[i].picture == list->item[0].picture) continue;
-        fprintf(stderr, "merge: %s and %s do not belong together: another scene, camera, method, size, depth or option\n",
+        fprintf(stderr,
+                "merge: %s and %s do not belong together: another scene, camera, method, size, depth or option\n",
                 list->item[0].path, list->item[i].path);
         return 1;
     }
@@ -390,7 +391,7 @@ static int show_help(void)
 {
     puts("merge OUT.pfm SHARE.pfm ... [--error FILE.pfm] [--png FILE.png]\n\n"
          "Makes one picture of the shares of `render --part i/n`, each by its number of samples, and says by their\n"
-         "spread how far it is off. --error also writes the standard error of each pixel, --png a picture for the eye.");
+         "spread how far it is off. --error also writes the standard error of each pixel, --png a picture to see.");
     return 0;
 }
 

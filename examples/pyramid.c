@@ -1,6 +1,7 @@
-/* pyramid.c: all ways to make a path, as pictures (section 3.1; Veach 1997, figure 10.3). A path of k edges can be made
-   by s vertices of a walk from the lamp and t of one from the eye, for every s + t = k + 1. Row k of the pyramid holds
-   these ways from s = 0 (the walk from the eye meets the lamp) to t = 1 (the walk from the lamp is joined to the eye).
+/* pyramid.c: all ways to make a path, as pictures (section 3.1; Veach 1997, figure 10.3). A path of k edges can be
+   made by s vertices of a walk from the lamp and t of one from the eye, for every s + t = k + 1. Row k of the pyramid
+   holds these ways from s = 0 (the walk from the eye meets the lamp) to t = 1 (the walk from the lamp is joined to
+   the eye).
 
    The first sheet shows what each way contributes when the power heuristic divides every path among the ways that can
    make it: the pictures of a row add up to what k edges do, and the rows to the picture. On the second sheet each way
@@ -8,8 +9,9 @@
 
    See: on the second sheet, what each way does badly. Those that wait for the walk to meet the lamp (s = 0) are a few
    bright dots; those that join two points of surfaces (s and t at least 2) have bright grains where the two may be
-   close, in corners; those from the lamp (t = 1) leave dark holes where few walks come. On the first sheet these faults
-   are gone: each way is asked only for what it does well, and s = 0, with a lamp this small, for next to nothing.
+   close, in corners; those from the lamp (t = 1) leave dark holes where few walks come. On the first sheet these
+   faults are gone: each way is asked only for what it does well, and s = 0, with a lamp this small, for next to
+   nothing.
 
    Writes out/pyramid.svg, out/pyramid_unweighted.svg, out/pyramid.csv, and the whole picture as out/pyramid.png and
    out/pyramid.pfm. */

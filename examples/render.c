@@ -655,7 +655,7 @@ static void add_vector(uint64_t *key, metro_vec3 v)
     add_key(key, v.z);
 }
 
-/* One number for what was rendered and how, but for the noise: shares that have another one do not belong together. */
+/* One number for what was rendered and how, but for the noise: shares with another one do not belong together. */
 static uint64_t picture_key(const work *w)
 {
     const metro_scene *scene = &w->scene;
@@ -829,9 +829,11 @@ static void say_trust(const work *w)
     if (!isnan(p->acceptance)) {
         printf("b %.5g +- %.2g; %.1f %% of the mutations accepted, %.1f %% dark, longest stay %llu mutations\n", p->b,
                p->b_error, 100 * p->acceptance, 100 * p->dark, (unsigned long long)p->longest_stay);
-        if (!isnan(p->rhat))
-            printf("over %lu chains: worst R-hat %.3f, smallest ESS %.0f\n", (unsigned long)w->made.chains, p->rhat,
-                   p->ess);
+        if (!isnan(p->rhat)) {
+            printf("over %lu chains: worst R-hat %.3f", (unsigned long)w->made.chains, p->rhat);
+            if (isnan(p->ess)) printf("; too few rounds for an ESS\n");
+            else printf(", smallest ESS %.0f\n", p->ess);
+        }
     }
     if (w->reference.value != NULL) {
         printf("relMSE %.4g", w->difference.relmse - w->noise);

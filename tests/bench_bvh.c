@@ -4,8 +4,8 @@
        cc -O2 -DNO_EMBREE tests/bench_bvh.c -lm  only measures
 
    Closed rooms of 40, 20 thousand and 500 thousand triangles; primary rays of a pinhole, diffuse rays from where
-   those hit, shadow rays to a lamp. Both sides get the same rays, with float-exact origins and directions. Each takes its
-   best of several turns, so that a noisy machine says little. A ratio is our speed over Embree's. */
+   those hit, shadow rays to a lamp. Both sides get the same rays, with float-exact origins and directions. Each takes
+   its best of several turns, so that a noisy machine says little. A ratio is our speed over Embree's. */
 
 #define METRO_STATIC
 #define METRO_IMPLEMENTATION
@@ -39,7 +39,7 @@ static void add(metro_scene *scene, metro_vec3 a, metro_vec3 b, metro_vec3 c)
 
 static double bump(double x, double y) { return 0.02 * sin(17 * x + 3 * y) * sin(13 * y - 5 * x); }
 
-/* The point at (u, v) in [0,1]^2 of face `face` of the room [-1,1]^3; faces are bumpy when there are many triangles. */
+/* The point at (u, v) in [0,1]^2 of face `face` of the room [-1,1]^3; faces of many triangles are bumpy. */
 static metro_vec3 wall_point(int face, int n, int i, int j)
 {
     double p[3], u = -1 + 2.0 * i / n, v = -1 + 2.0 * j / n, rim = (1 - u * u) * (1 - v * v);

@@ -711,8 +711,8 @@ static void leaving_hits_not_oneself(void)
         }
 }
 
-/* Contact shadows: a plate 1e-5 of its size above a floor hides the sky from under it; and in a corner of a room a ray
-   does not slip out through the other wall. */
+/* Contact shadows: a plate 1e-5 of its size above a floor hides the sky from under it; and in a corner of a room a
+   ray does not slip out through the other wall. */
 static void leaving_keeps_what_is_near(void)
 {
     static const double size[3] = { 1e-4, 1, 1e4 };

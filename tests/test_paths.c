@@ -237,9 +237,9 @@ static metro_scene room_scene(void)
 }
 
 /* Each way of each path counts f / p, and f / p times its weight of eq 12.3, as products of the densities of all
-   vertices from both sides say that are computed here from the corners of the path, and as often as each is tried. Catches: any cosine or distance
-   dropped or squared, a reverse density for the other direction, a nest that misses a link, the lamp's emission drawn
-   uniformly, the camera's density in the wrong place, 1 for 1/(4 pi). */
+   vertices from both sides say that are computed here from the corners of the path, and as often as each is tried.
+   Catches: any cosine or distance dropped or squared, a reverse density for the other direction, a nest that misses a
+   link, the lamp's emission drawn uniformly, the camera's density in the wrong place, 1 for 1/(4 pi). */
 static void weights_by_products(void)
 {
     static const metro_method method[3] = { METRO_BDPT, METRO_MLT, METRO_PATH };
@@ -523,10 +523,10 @@ static void furnaces(void)
     furnace(7, 0.5, 1, 8, 256, 0.01);
 }
 
-/* A walk from a lamp serves a group of pixels: in pictures whose pixels make no whole groups the mean is right, and the
-   error that few rounds give knows that a group has a walk in common: in a furnace, where no pixel is brighter than
-   another, it is the spread over runs. Catches: pixels left out or counted twice, a walk that serves fewer than it is
-   counted for, samples of a group taken for independent. */
+/* A walk from a lamp serves a group of pixels: in pictures whose pixels make no whole groups the mean is right, and
+   the error that few rounds give knows that a group has a walk in common: in a furnace, where no pixel is brighter
+   than another, it is the spread over runs. Catches: pixels left out or counted twice, a walk that serves fewer than
+   it is counted for, samples of a group taken for independent. */
 static void groups_of_pixels(void)
 {
     static const size_t size[6][2] = { { 1, 1 }, { 3, 1 }, { 7, 1 }, { 5, 13 }, { 16, 17 }, { 31, 9 } };
@@ -545,8 +545,9 @@ static void groups_of_pixels(void)
         render = render_run(&scene, &camera, &options,
                             check_count(160 * (double)(300 / (size[i][0] * size[i][1]) + 1), 160));
         metro_render_diagnose(&render, &report);
-        CHECK(fabs(report.mean - truth) <= student_bound(15) * report.mean_error, "%d x %d: %.6g +- %.2g, should be %.6g",
-              (int)size[i][0], (int)size[i][1], report.mean, report.mean_error, truth);
+        CHECK(fabs(report.mean - truth) <= student_bound(15) * report.mean_error,
+              "%d x %d: %.6g +- %.2g, should be %.6g", (int)size[i][0], (int)size[i][1], report.mean,
+              report.mean_error, truth);
         CHECK(report.mean_error < 0.02 * truth / sqrt(check_scale()), "%d x %d: error %g", (int)size[i][0],
               (int)size[i][1], report.mean_error);
         image = render_image(&render);

@@ -960,9 +960,10 @@ static void distances_bound_the_density(void)
                 CHECK_NEAR(metro_startup_total_variation_bound(&k, 1), variation, 1e-9);
                 CHECK_NEAR(metro_startup_divergence_bound(&k, 1), divergence, 1e-9);
             } else {
-                CHECK(metro_startup_total_variation_bound(&k, (uint64_t)n) > variation * (1 - 1e-9), "shape %d n %d", shape,
-                      n);
-                CHECK(metro_startup_divergence_bound(&k, (uint64_t)n) > divergence * (1 - 1e-9), "shape %d n %d", shape, n);
+                CHECK(metro_startup_total_variation_bound(&k, (uint64_t)n) > variation * (1 - 1e-9), "shape %d n %d",
+                      shape, n);
+                CHECK(metro_startup_divergence_bound(&k, (uint64_t)n) > divergence * (1 - 1e-9), "shape %d n %d",
+                      shape, n);
                 CHECK(metro_startup_total_variation_bound(&k, (uint64_t)n) <= 1, "shape %d n %d", shape, n);
             }
         }
