@@ -14993,8 +14993,9 @@ static void metroi_stretch_exchange(metroi_bundle *bundle, const metroi_shadow *
 /* Two triangles that face each other from x to `end`: their patches exchange what they send, both ways. */
 
 METROI_INLINE void metroi_sweep_exchange(metroi_bundle *bundle, metroi_shadow *a, metroi_shadow *b, double x,
-                                         double end, double y, int whole_lines, int linear)
+                                         double end, double y, int whole_lines)
 {
+    int linear = bundle->nodes == 3;
     while (a->stairs.next <= x) metroi_stairs_step(&a->stairs, whole_lines);
     while (b->stairs.next <= x) metroi_stairs_step(&b->stairs, whole_lines);
     for (;;) {
@@ -15034,8 +15035,8 @@ static void metroi_sweep_lose(metroi_bundle *bundle, metroi_shadow *a, double x,
 
 /* The pair `low`, `high` in the pile stops being neighbours at x; NULL stands for nothing. */
 
-METROI_INLINE void metroi_sweep_part(metroi_bundle *bundle, metroi_shadow *low, metroi_shadow *high, double x,
-                                     double y, int whole_lines, int linear)
+static void metroi_sweep_part(metroi_bundle *bundle, metroi_shadow *low, metroi_shadow *high, double x, double y,
+                              int whole_lines)
 {
     double since = low != NULL ? low->since : bundle->since;
     int up = low != NULL && low->outline.up, down = high != NULL && !high->outline.up;
@@ -15044,7 +15045,7 @@ METROI_INLINE void metroi_sweep_part(metroi_bundle *bundle, metroi_shadow *low, 
     if (!(x > since) || !(up || down) || !(bundle->balance || (up && down))) return;
     if (up && !low->ready) metroi_stairs_make(low, y, whole_lines);
     if (down && !high->ready) metroi_stairs_make(high, y, whole_lines);
-    if (up && down) metroi_sweep_exchange(bundle, low, high, since, x, y, whole_lines, linear);
+    if (up && down) metroi_sweep_exchange(bundle, low, high, since, x, y, whole_lines);
     else if (up)
         metroi_sweep_lose(bundle, low, since, x, whole_lines, high == NULL ? bundle->escaped : bundle->absorbed);
     else metroi_sweep_lose(bundle, high, since, x, whole_lines, low == NULL ? bundle->escaped : bundle->absorbed);
@@ -15062,7 +15063,7 @@ METROI_INLINE int metroi_sweep_comes_first(const metroi_bundle *bundle, const me
 
 /* Sweeps the row at y with its `spans` spans, which are in order of their left ends. */
 
-METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double y, int whole_lines, int linear)
+static void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double y, int whole_lines)
 {
     metroi_shadow **pile = bundle->pile;
     size_t begun = 0, height = 0, place, i;
@@ -15076,15 +15077,15 @@ METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double 
             metroi_shadow *low = ending > 0 ? pile[ending - 1] : NULL;
             metroi_shadow *high = ending + 1 < height ? pile[ending + 1] : NULL;
             double x = span->right;
-            metroi_sweep_part(bundle, low, span, x, y, whole_lines, linear);
-            metroi_sweep_part(bundle, span, high, x, y, whole_lines, linear);
+            metroi_sweep_part(bundle, low, span, x, y, whole_lines);
+            metroi_sweep_part(bundle, span, high, x, y, whole_lines);
             for (i = ending + 1; i < height; i++) pile[i - 1] = pile[i];
             height--;
         } else {
             metroi_shadow *span = bundle->row[begun++];
             for (place = 0; place < height && metroi_sweep_comes_first(bundle, pile[place], span, y);) place++;
             metroi_sweep_part(bundle, place > 0 ? pile[place - 1] : NULL, place < height ? pile[place] : NULL,
-                              span->left, y, whole_lines, linear);
+                              span->left, y, whole_lines);
             span->since = span->left;
             for (i = height; i > place; i--) pile[i] = pile[i - 1];
             pile[place] = span;
@@ -15097,7 +15098,7 @@ METROI_INLINE void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double 
    order already, so they are sorted by insertion. Spans that meet no line are left out of the row, but not of the
    next. */
 
-METROI_INLINE size_t metroi_sweep_cut(metroi_bundle *bundle, size_t *live, int32_t row, int whole_lines)
+static size_t metroi_sweep_cut(metroi_bundle *bundle, size_t *live, int32_t row, int whole_lines)
 {
     double y = (double)row + 0.5;
     metroi_shadow **list = bundle->row, *span;
@@ -15150,21 +15151,20 @@ static void metroi_sweep_prepare(metroi_bundle *bundle)
     }
 }
 
-METROI_INLINE void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines, int linear)
+static void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines)
 {
     size_t live = 0;
     int32_t row;
     metroi_sweep_prepare(bundle);
     for (row = 0; row < (int32_t)bundle->rows; row++) {
         size_t spans = metroi_sweep_cut(bundle, &live, row, whole_lines);
-        metroi_sweep_row(bundle, spans, (double)row + 0.5, whole_lines, linear);
+        metroi_sweep_row(bundle, spans, (double)row + 0.5, whole_lines);
     }
 }
 
 static void metroi_sweep(metroi_bundle *bundle)
 {
-    if (bundle->nodes == 3) metroi_sweep_rows(bundle, 1, 1);
-    else metroi_sweep_rows(bundle, 1, 0);
+    metroi_sweep_rows(bundle, 1);
 }
 
 /* # 14.4 Fragments
@@ -15385,8 +15385,7 @@ static void metroi_painter(metroi_bundle *bundle)
 
 static void metroi_sweep_lines(metroi_bundle *bundle)
 {
-    if (bundle->nodes == 3) metroi_sweep_rows(bundle, 0, 1);
-    else metroi_sweep_rows(bundle, 0, 0);
+    metroi_sweep_rows(bundle, 0);
 }
 
 static void metroi_bundle_free(metroi_bundle *bundle)
