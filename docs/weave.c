@@ -2338,24 +2338,36 @@ static span lines_join(const prose *p, size_t i, size_t n, size_t skip, text *jo
     return span_of_text(joined);
 }
 
+/* An item goes on in lines that stand under its first word, also where a number of two digits has moved that as far in
+   as a block would be. */
 static size_t item_put(weave *w, text *out, const prose *p, size_t i)
 {
     text joined = { NULL, 0, 0 };
-    size_t n = 1;
-    while (i + n < p->count && !line_breaks(p, i + n) && item_mark(p->line[i + n]) == 0) n++;
+    size_t n = 1, mark = item_mark(p->line[i]);
+    while (i + n < p->count && item_mark(p->line[i + n]) == 0 &&
+           (!line_breaks(p, i + n) || (p->line[i + n].size > 0 && span_indent(p->line[i + n]) == mark)))
+        n++;
     text_put(out, "<li>");
-    prose_inline(w, out, lines_join(p, i, n, item_mark(p->line[i]), &joined), p->first + i);
+    prose_inline(w, out, lines_join(p, i, n, mark, &joined), p->first + i);
     text_put(out, "</li>\n");
     text_free(&joined);
     return n;
 }
 
-/* Items may be apart by one empty line. */
+/* Items may be apart by one empty line. Numbers go on from the first. */
 static size_t list_put(weave *w, text *out, const prose *p, size_t i)
 {
     int dashes = p->line[i].at[span_indent(p->line[i])] == '-';
     size_t n = 0;
-    text_put(out, dashes ? "<ul>\n" : "<ol>\n");
+    if (dashes) text_put(out, "<ul>\n");
+    else {
+        span number = span_trim(p->line[i]);
+        size_t digits = 0;
+        while (is_digit(span_at(number, digits))) digits++;
+        text_put(out, "<ol start=\"");
+        text_put_span(out, span_part(number, 0, digits));
+        text_put(out, "\">\n");
+    }
     for (;;) {
         span next = prose_line(p, i + n);
         size_t gap = next.size == 0 && n > 0 ? 1 : 0;
@@ -2584,7 +2596,8 @@ static void page_style(text *out)
         "@media print{@page{margin:18mm 16mm}:root{--page:#fff;--ink:#000;--code:#fff;--rule:#bbb;--soft:#444;",
         "--link:#000;--c:#333;--k:#000;--s:#000;--d:#000;--mark:#fff}body{display:block;font-size:10pt}",
         "nav{display:none}main{padding:0;max-width:none}main>*,.contract>*,main>pre,main>section{max-width:none}",
-        "h2{break-before:page;border:0;margin-top:0}h1,h2,h3,h4{break-after:avoid}figure,.equation,tr{",
+        "h2{break-before:page;border:0;margin-top:0}.lecture h2{break-before:auto;margin-top:2rem}",
+        "h1,h2,h3,h4{break-after:avoid}figure,.equation,tr{",
         "break-inside:avoid}pre{font-size:6.6pt;line-height:1.35;border:0;padding:0;overflow:visible}",
         ".entry{break-inside:avoid}.entry pre{break-after:avoid}.code code{width:auto}",
         ".l{white-space:pre-wrap;overflow-wrap:anywhere;",

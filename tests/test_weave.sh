@@ -116,7 +116,7 @@ SAMPLE
     echo '*/' >> metro.h
     printf '# made by size\nDelta,M,mse\n0.1,100,1.5e-05\n0.1,1000,3\n0.2,100,4\n' > out/size.csv
     printf '<?xml version="1.0"?>\n<svg viewBox="0 0 9 9"><path d="M0 0"/></svg>\n' > out/chart.svg
-    printf '# A lecture\n\nSee *eq 1.1* and section 1.1.\n\n[function: metro_add]\n' > docs/first.md
+    printf '# A lecture\n\nSee *eq 1.1* and section 1.1.\n\n[function: metro_add]\n\n9. Nine\n   words.\n10. Ten\n    more.\n11. Last.\n' > docs/first.md
     printf '\n| a | b |\n|---|---|\n| 1 | 2 |\n' >> docs/first.md
     echo 'int main(void) { return metro_add(1, 2) + metro_first(p) + metro_same(1); }' > tests/test_all.c
 }
@@ -154,6 +154,8 @@ holds "a definition" book/index.html '<a class="name" id="def-metro_add" href="#
 holds "the code of an equation" book/index.html 'code: <a href="#metro_add">metro_add</a>, line <a href="#L63">63</a>'
 holds "a pulled function" book/first.html 'href="index.html#L61">61</a>'
 holds "a lecture's citation" book/first.html '<em><a href="index.html#eq-1.1">eq 1.1</a></em>'
+holds "items that number on from nine" book/first.html '<ol start="9">'
+holds "an item under a number of two digits" book/first.html 'more.</li>'
 mv book again
 check
 diff -r book again > message
