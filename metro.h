@@ -15151,7 +15151,7 @@ static void metroi_sweep_prepare(metroi_bundle *bundle)
     }
 }
 
-static void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines)
+static void metroi_sweep(metroi_bundle *bundle, int whole_lines)
 {
     size_t live = 0;
     int32_t row;
@@ -15160,11 +15160,6 @@ static void metroi_sweep_rows(metroi_bundle *bundle, int whole_lines)
         size_t spans = metroi_sweep_cut(bundle, &live, row, whole_lines);
         metroi_sweep_row(bundle, spans, (double)row + 0.5, whole_lines);
     }
-}
-
-static void metroi_sweep(metroi_bundle *bundle)
-{
-    metroi_sweep_rows(bundle, 1);
 }
 
 /* # 14.4 Fragments
@@ -15385,7 +15380,7 @@ static void metroi_painter(metroi_bundle *bundle)
 
 static void metroi_sweep_lines(metroi_bundle *bundle)
 {
-    metroi_sweep_rows(bundle, 0);
+    metroi_sweep(bundle, 0);
 }
 
 static void metroi_bundle_free(metroi_bundle *bundle)
@@ -15458,7 +15453,7 @@ static void metroi_bundle_move(metroi_bundle *bundle, metro_vec3 direction, cons
     memset(bundle->escaped, 0, sizeof bundle->escaped);
     memset(bundle->absorbed, 0, sizeof bundle->absorbed);
     switch (bundle->visibility) {
-    case METRO_SWEEP: metroi_sweep(bundle); break;
+    case METRO_SWEEP: metroi_sweep(bundle, 1); break;
     case METRO_FRAGMENTS: metroi_fragments(bundle); break;
     case METRO_PAINTER: metroi_painter(bundle); break;
     case METRO_LINES: metroi_sweep_lines(bundle); break;
@@ -15562,7 +15557,7 @@ typedef struct {
     uint64_t key;
     uint64_t rounds;         /* made so far, of one walk a batch */
     uint64_t at_once;        /* how many a batch makes before it waits for the others */
-    int started;             /* the chains are */
+    int started;             /* the chains have looked for their starts */
     size_t alive;            /* chains that found a start */
     metro_bundles *shown;    /* whose numbers grow, and whom to ask whether to stop */
     int (*stop)(const metro_bundles *bundles, void *user);
@@ -15770,8 +15765,7 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
    But then every other point has the first coordinate of the one before it, plus 1/2: neighbours avoid each other.
    The pairs of two directions lie on a few lines of the square of their coordinates and do not fill it, however many
    walks are made, so the products of eq 14.8 are integrated over a part of the space only. The picture converges, and
-   it is wrong. A random shift of the whole
-   sequence, modulo 1, makes the batches independent and does not help.
+   it is wrong. A random shift of the whole sequence, modulo 1, makes the batches independent and does not help.
 
    [figure: runon.svg | A sequence that runs on converges to a wrong answer: error against walks.] */
 

@@ -2345,7 +2345,7 @@ static size_t item_put(weave *w, text *out, const prose *p, size_t i)
     text joined = { NULL, 0, 0 };
     size_t n = 1, mark = item_mark(p->line[i]);
     while (i + n < p->count && item_mark(p->line[i + n]) == 0 &&
-           (!line_breaks(p, i + n) || (p->line[i + n].size > 0 && span_indent(p->line[i + n]) == mark)))
+           (!line_breaks(p, i + n) || (mark >= BLOCK_INDENT && span_indent(p->line[i + n]) == mark)))
         n++;
     text_put(out, "<li>");
     prose_inline(w, out, lines_join(p, i, n, mark, &joined), p->first + i);
@@ -2361,11 +2361,9 @@ static size_t list_put(weave *w, text *out, const prose *p, size_t i)
     size_t n = 0;
     if (dashes) text_put(out, "<ul>\n");
     else {
-        span number = span_trim(p->line[i]);
-        size_t digits = 0;
-        while (is_digit(span_at(number, digits))) digits++;
+        size_t indent = span_indent(p->line[i]);
         text_put(out, "<ol start=\"");
-        text_put_span(out, span_part(number, 0, digits));
+        text_put_span(out, span_part(p->line[i], indent, item_mark(p->line[i]) - indent - 2));
         text_put(out, "\">\n");
     }
     for (;;) {

@@ -611,6 +611,7 @@ static double rate_ratio(const table *t, const char *what, int first, double *er
     return sum / w;
 }
 
+/* One angle at which the theory is off suffices; in the box the widest is off most, since most is rejected there. */
 static void theory_validated(const table *const *t, finding *f)
 {
     double e[2], furnace = rate_ratio(t[0], "furnace", 0, &e[0]), box = rate_ratio(t[0], "Cornell box", 3, &e[1]);

@@ -278,7 +278,6 @@ PLOT_API void plot_csv_text(plot_csv *csv, const char *text)
     for (; *text != 0; text++) ploti_put_bytes(&csv->text, strchr(",\"\r\n", *text) != NULL ? " " : text, 1);
 }
 
-/* Numbers as the rest of the row, and its end. */
 /* A whole number too large for a double, such as a seed. */
 PLOT_API void plot_csv_whole(plot_csv *csv, unsigned long long value)
 {
@@ -287,6 +286,7 @@ PLOT_API void plot_csv_whole(plot_csv *csv, unsigned long long value)
     plot_csv_text(csv, text);
 }
 
+/* Numbers as the rest of the row, and its end. */
 PLOT_API void plot_csv_row(plot_csv *csv, const double *value, size_t count)
 {
     size_t i;

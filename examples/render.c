@@ -676,6 +676,7 @@ static uint64_t picture_key(const work *w)
     add_key(&key, w->camera.fov);
     add_key(&key, (double)w->asked.answers[METHOD].whole[0]);
     add_key(&key, (double)w->image.width);
+    add_key(&key, (double)w->image.height);
     add_key(&key, w->made.depth);
     add_key(&key, w->made.perturbation);
     add_key(&key, w->made.large_step);
