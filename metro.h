@@ -11373,17 +11373,81 @@ METRO_API void metro_scene_free(metro_scene *scene)
 #define METROI_ROUND_EACH
 #endif
 
+/* Processors have instructions that do the same to four floats. A wrapper gives one name to those of SSE2, which
+   every 64-bit PC has, and of NEON, which every 64-bit ARM has; elsewhere, or with METRO_NO_SIMD defined, plain C
+   does the work. Minimum and maximum keep the second number when one is NaN, and a mask has a bit for each sign. */
+
+#if !defined(METRO_NO_SIMD) && defined(__GNUC__) && !defined(__TINYC__) && defined(__SSE2__)
+#define METROI_SIMD
+#define METROI_AVX2 __attribute__((target("avx2,bmi,fma")))
+#include <immintrin.h>
+
+typedef __m128 metroi_v4;
+METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return _mm_loadu_ps(p); }
+METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { _mm_storeu_ps(p, a); }
+METROI_INLINE metroi_v4 metroi_v4_all(float x) { return _mm_set1_ps(x); }
+METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return _mm_add_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return _mm_sub_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return _mm_mul_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return _mm_div_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return _mm_min_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return _mm_max_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return _mm_cmple_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b) { return _mm_and_ps(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b) { return _mm_or_ps(a, b); }
+METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a) { return (unsigned)_mm_movemask_ps(a); }
+METROI_INLINE metroi_v4 metroi_v4_from(metro_vec3 a)
+{
+    return _mm_movelh_ps(_mm_cvtpd_ps(_mm_set_pd(a.y, a.x)), _mm_cvtpd_ps(_mm_set_sd(a.z)));
+}
+
+#elif !defined(METRO_NO_SIMD) && defined(__GNUC__) && defined(__aarch64__) && defined(__ARM_NEON)
+#define METROI_SIMD
+#include <arm_neon.h>
+
+typedef float32x4_t metroi_v4;
+METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return vld1q_f32(p); }
+METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { vst1q_f32(p, a); }
+METROI_INLINE metroi_v4 metroi_v4_all(float x) { return vdupq_n_f32(x); }
+METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return vaddq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return vsubq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return vmulq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return vdivq_f32(a, b); }
+METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
+METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
+METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return vreinterpretq_f32_u32(vcleq_f32(a, b)); }
+METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b)
+{
+    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
+}
+METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b)
+{
+    return vreinterpretq_f32_u32(vorrq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
+}
+METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a)
+{
+    static const uint32_t bit[4] = { 1, 2, 4, 8 };
+    return vaddvq_u32(vandq_u32(vcltzq_s32(vreinterpretq_s32_f32(a)), vld1q_u32(bit)));
+}
+METROI_INLINE metroi_v4 metroi_v4_from(metro_vec3 a)
+{
+    float64x2_t xy = { a.x, a.y }, z = { a.z, 0 };
+    return vcombine_f32(vcvt_f32_f64(xy), vcvt_f32_f64(z));
+}
+#endif
+
 /* A ray comes with an origin and a direction in any units. We divide the origin by the scene's size and the direction
    by its own largest component, which makes that component 1 or -1 and t a length in units of the scene. Multiplied
    by `unit` it is the caller's t again. The bounds that the caller gave are compared as doubles, with the caller's t;
    inside, bounds that are a little too wide save time and decide nothing. */
 
 typedef struct {
-    float origin[3], direction[3];
-    float inverse[3];             /* 1 / direction, perhaps infinite */
-    float reach[3], spare[3];     /* the same but finite; what 10.7 adds where it was infinite, else 0 */
-    size_t near_row[3], far_row[3]; /* the rows of metroi_node.bound, in floats, where the ray enters and leaves */
-    int axis[3];                  /* the last is the axis of the component 1 or -1, `side` */
+    METROI_ALIGNED float origin[4]; /* here and below the fourth number is idle */
+    float direction[4];
+    float inverse[4];             /* 1 / direction, perhaps infinite */
+    float reach[4], spare[4];     /* the same but finite; what 10.7 adds where it was infinite, else 0 */
+    const unsigned char *row;     /* three rows of metroi_node.bound where the ray enters, three where it leaves */
+    size_t axis[3];               /* the last is the axis of the component 1 or -1, `side` */
     float side, shear[2];
     float t_min, t;               /* hits are looked for from t_min to t, which shrinks as they are found */
     uint32_t triangle;            /* the nearest so far */
@@ -11427,42 +11491,64 @@ METROI_INLINE double metroi_largest(metro_vec3 a)
    that this plane has no opinion. So every minimum and maximum is written so that a NaN in the new number leaves the
    old one.
 
-   Rounding may make the time of entrance too late and that of exit too early. A difference, an inverse and a product
-   round once each, by at most 6e-8, so if the later of the two is made longer by six times that, no box is missed
-   that the exact ray would hit (Ize 2013). For the box of a single triangle 10.7 asks for more, 1e-6, and boxes of
-   nodes get a little more again, for the reason that is given there. */
+   Rounding may make the time of entrance too late and that of exit too early. A difference and a product round once
+   each, by at most 6e-8, and the inverse three times, with the two floats that it is the quotient of. So if the later
+   of the two is made longer by ten times that, no box is missed that the exact ray would hit (Ize 2013). For the box
+   of a single triangle 10.7 asks for more, 1e-6, and boxes of nodes get a little more again, for the reason that is
+   given there. */
 
 #define METROI_PAD 1.000001f
 #define METROI_PAD_NODE 1.0000015f
+#define METROI_REACH 3e38f /* stands for infinity where that would become NaN */
 
-METROI_INLINE void metroi_ray_axis(metroi_ray *ray, size_t k, double origin, double direction)
+/* Makes floats of the ray, and returns a bit for each negative component. A walk begins with the inverse, so that is
+   a quotient of floats and does not wait for `unit`, the direction divided by its largest component. */
+METROI_INLINE unsigned metroi_ray_floats(metroi_ray *ray, metro_vec3 o, metro_vec3 d, double largest, metro_vec3 unit)
 {
-    float inverse = 1.0f / (float)direction;
-    size_t upper = 24 * (size_t)(metroi_float_bits(inverse) >> 31); /* no branch: signs are random */
-    ray->origin[k] = (float)origin;
-    ray->direction[k] = (float)direction;
-    ray->inverse[k] = ray->reach[k] = inverse;
-    ray->spare[k] = 0;
-    ray->near_row[k] = 8 * k + upper;
-    ray->far_row[k] = 8 * k + (24 - upper);
+#ifdef METROI_SIMD
+    metroi_v4 way = metroi_v4_from(d), inverse = metroi_v4_div(metroi_v4_all((float)largest), way);
+    metroi_v4 most = metroi_v4_all(METROI_REACH), least = metroi_v4_all(-METROI_REACH);
+    metroi_v4 reach = metroi_v4_low(metroi_v4_high(inverse, least), most);
+    metroi_v4 endless = metroi_v4_or(metroi_v4_le(reach, least), metroi_v4_le(most, reach));
+    metroi_v4_store(ray->origin, metroi_v4_from(o));
+    metroi_v4_store(ray->direction, metroi_v4_from(unit));
+    metroi_v4_store(ray->inverse, inverse);
+    metroi_v4_store(ray->reach, reach);
+    metroi_v4_store(ray->spare, metroi_v4_and(endless, most));
+    return metroi_v4_mask(way) & 7;
+#else
+    const double from[3] = { o.x, o.y, o.z }, way[3] = { d.x, d.y, d.z }, along[3] = { unit.x, unit.y, unit.z };
+    unsigned signs = 0, k;
+    for (k = 0; k < 3; k++) {
+        float inverse = (float)largest / (float)way[k];
+        ray->origin[k] = (float)from[k];
+        ray->direction[k] = (float)along[k];
+        ray->inverse[k] = inverse;
+        ray->reach[k] = metroi_low(metroi_high(inverse, -METROI_REACH), METROI_REACH);
+        ray->spare[k] = ray->reach[k] <= -METROI_REACH || METROI_REACH <= ray->reach[k] ? METROI_REACH : 0;
+        signs |= (unsigned)(inverse < 0) << k; /* knows -0, too */
+    }
+    return signs;
+#endif
 }
 
-/* Which axis comes last is computed without a branch, too. */
-METROI_INLINE void metroi_ray_directions(metroi_ray *ray, metro_vec3 d)
+/* Which axis comes last, and where a ray enters a box, is computed without a branch: directions are random. */
+METROI_INLINE void metroi_ray_axes(metroi_ray *ray, metro_vec3 d, unsigned signs)
 {
-    static const int next[4] = { 1, 2, 0, 1 };
+    static const unsigned char next[4] = { 1, 2, 0, 1 };
+    static const unsigned char row[8][6] = {
+        { 0, 8, 16, 24, 32, 40 }, { 24, 8, 16, 0, 32, 40 }, { 0, 32, 16, 24, 8, 40 }, { 24, 32, 16, 0, 8, 40 },
+        { 0, 8, 40, 24, 32, 16 }, { 24, 8, 40, 0, 32, 16 }, { 0, 32, 40, 24, 8, 16 }, { 24, 32, 40, 0, 8, 16 }
+    };
     int y = fabs(d.y) > fabs(d.x), z = fabs(d.z) > metroi_larger(fabs(d.x), fabs(d.y));
-    int last = 2 * z + (y & (1 - z)), k;
+    int last = 2 * z + (y & (1 - z));
+    ray->row = row[signs];
     ray->axis[0] = next[last];
     ray->axis[1] = next[last + 1];
     ray->axis[2] = last;
     ray->side = ray->direction[last];
-    for (k = 0; k < 2; k++) ray->shear[k] = ray->direction[ray->axis[k]] * ray->side;
-    for (k = 0; k < 3; k++)
-        if (!(fabs((double)ray->inverse[k]) < 3e38)) {
-            ray->reach[k] = ray->inverse[k] > 0 ? 3e38f : -3e38f;
-            ray->spare[k] = 3e38f;
-        }
+    ray->shear[0] = ray->direction[ray->axis[0]] * ray->side;
+    ray->shear[1] = ray->direction[ray->axis[1]] * ray->side;
 }
 
 /* A ray that begins far away, or before t = 0, is moved along itself to a distance of about 2 from the middle of the
@@ -11476,8 +11562,8 @@ static int metroi_ray_enter(metro_vec3 *o, metro_vec3 d, double t_min, double *s
     return metro_dot(*o, *o) < 64;
 }
 
-/* Returns 0 for a ray that hits nothing; a NaN makes the squares NaN, which are not below anything. `boost` brings
-   directions into the range where one over them is a number. */
+/* Returns 0 for a ray that hits nothing. A NaN is in no range; two of three in the direction get by, and fail all
+   comparisons of 10.7. */
 METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec3 d, double t_min, double t_max,
                                   metroi_ray *ray)
 {
@@ -11485,17 +11571,16 @@ METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec
     if (bvh == NULL || bvh->block_count == 0 || !(t_min < t_max)) return 0;
     unit = bvh->size;
     per_unit = bvh->scale;
-    if (!(largest > 1e-200 && largest < 1e200)) {
-        double boost = ldexp(1.0, largest < 1 ? 600 : -600);
+    while (!(largest > 1e-15 && largest < 1e15)) { /* brings directions into the range of floats */
+        double boost = largest < 1 ? 1099511627776.0 : 1 / 1099511627776.0;
+        if (!(largest > 0 && largest < METROI_INFINITY)) return 0;
         d = metro_scale(d, boost);
         largest *= boost;
         unit *= boost;
         per_unit /= boost;
     }
     inverse = 1 / largest;
-    d = metro_scale(d, inverse);
     o = metro_scale(o, bvh->scale);
-    if (!(metro_dot(d, d) < 4)) return 0;
     ray->unit = unit * inverse;
     ray->least = t_min;
     ray->most = t_max;
@@ -11503,7 +11588,7 @@ METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec
     low = t_min == 0 ? 0 : t_min * (largest * per_unit);
     high = t_max < METROI_INFINITY ? t_max * (largest * per_unit) : t_max;
     if (t_min < 0 || !(metro_dot(o, o) < 16)) {
-        if (!metroi_ray_enter(&o, d, low, &ray->start)) return 0;
+        if (!metroi_ray_enter(&o, metro_scale(d, inverse), low, &ray->start)) return 0;
         low -= ray->start + 1e-15 * fabs(ray->start);
         high -= ray->start - 1e-15 * fabs(ray->start);
     }
@@ -11511,10 +11596,7 @@ METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec
     ray->t_min = (float)(metroi_larger(low, 0) * (1 - 1e-6));
     ray->t = high < 15 ? (float)(high * (1 + 1e-6)) : 16;
     ray->triangle = METROI_NONE;
-    metroi_ray_axis(ray, 0, o.x, d.x);
-    metroi_ray_axis(ray, 1, o.y, d.y);
-    metroi_ray_axis(ray, 2, o.z, d.z);
-    metroi_ray_directions(ray, d);
+    metroi_ray_axes(ray, d, metroi_ray_floats(ray, o, d, largest, metro_scale(d, inverse)));
     return 1;
 }
 
@@ -11530,7 +11612,7 @@ METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_
     for (i = 0; i < 8; i++) near_t[i] = ray->t_min;
     for (i = 0; i < 8; i++) far_t[i] = ray->t;
     for (k = 0; k < 3; k++) { /* eq 10.5 */
-        const float *near_row = node->bound + ray->near_row[k], *far_row = node->bound + ray->far_row[k];
+        const float *near_row = node->bound + ray->row[k], *far_row = node->bound + ray->row[k + 3];
         float o = ray->origin[k], r = ray->inverse[k], padded = ray->inverse[k] * METROI_PAD_NODE;
         for (i = 0; i < 8; i++) near_t[i] = metroi_high((near_row[i] - o) * r, near_t[i]);
         for (i = 0; i < 8; i++) far_t[i] = metroi_low((far_row[i] - o) * padded, far_t[i]);
@@ -11576,13 +11658,14 @@ METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_
 
    which also gives a floor that is a thousand times as large as what stands on it the height that it has. But the box
    must not refuse what eq 10.7 accepts, or the ray is lost to both neighbours. Rounding displaces a corner of eq 10.6
-   along x by at most 6e-8 of p_x - o_x and of s_x z_p. With the point h where the ray hits, and L the extent of the
-   triangle, both are below h_x - o_x plus L, since s_x z_h is h_x - o_x; so the corner is off by 1.8e-7 of t, in
-   time, and by 1.8e-7 of L, in length. Rounding the products of eq 10.7 moves an edge by a few 1e-7 of L. The part in
-   t, and the rounding of both times of eq 10.5, are within the pad. The part in L is not: it counts where a ray
-   begins close to the edge of a large triangle, whose far corners are rounded though the hit is near. So the box has
-   a margin when it is asked whether the ray meets it; L is at most twice the largest coordinate. It has none when it
-   is asked for t_near, or whether all of it is behind the ray, for those need no more than a sign and a maximum.
+   along x by at most 6e-8 of p_x - o_x and, with the rounding of s_x, twice that of s_x z_p. With the point h where
+   the ray hits, and L the extent of the triangle, both are below h_x - o_x plus L, since s_x z_h is h_x - o_x; so,
+   with the difference, the corner is off by 2.4e-7 of t, in time, and by 2.4e-7 of L, in length. Rounding the
+   products of eq 10.7 moves an edge by a few 1e-7 of L. The part in t, and the rounding of both times of eq 10.5, are
+   within the pad. The part in L is not: it counts where a ray begins close to the edge of a large triangle, whose far
+   corners are rounded though the hit is near. So the box has a margin when it is asked whether the ray meets it; L is
+   at most twice the largest coordinate. It has none when it is asked for t_near, or whether all of it is behind the
+   ray, for those need no more than a sign and a maximum.
 
    A box around this box and its margin has its planes farther out, and rounding is monotonic, so its t_near is not
    larger, and its t_far not smaller: hence its larger pad, for which the corner is multiplied by a rounded product
@@ -11625,12 +11708,10 @@ METROI_INLINE int metroi_own_box(const metroi_block *block, int i, const metroi_
 }
 
 /* Tests the four triangles of a block, and returns a bit for each that is hit between t_min and t. */
-METROI_INLINE unsigned metroi_block_plain(const metroi_block *block, const metroi_ray *ray, const void *spread,
-                                          metroi_lanes *lanes)
+METROI_INLINE unsigned metroi_block_plain(const metroi_block *block, const metroi_ray *ray, metroi_lanes *lanes)
 {
     int kx = ray->axis[0], ky = ray->axis[1], kz = ray->axis[2], i, j;
     unsigned mask = 0;
-    (void)spread;
     for (i = 0; i < 4; i++) {
         float x[3], y[3], z[3], U, V, W, T, t, enter;
         for (j = 0; j < 3; j++) { /* eq 10.6 */
@@ -11689,92 +11770,23 @@ METROI_INLINE void metroi_ray_take(metroi_ray *ray, const metroi_block *block, c
 
 /* # 10.8 Four and eight at once
 
-   Processors have instructions that do the same to four or eight floats. The wrapper gives one name to those of SSE2,
-   which every 64-bit PC has, and of NEON, which every 64-bit ARM has; elsewhere, or with METRO_NO_SIMD defined, the
-   plain functions above do the work. The functions below are the same tests with the same operations in the same
-   order. Minimum and maximum keep the second number when one is NaN. */
-
-#if !defined(METRO_NO_SIMD) && defined(__GNUC__) && !defined(__TINYC__) && defined(__SSE2__)
-#define METROI_SIMD
-#define METROI_AVX2 __attribute__((target("avx2,bmi,fma")))
-#include <immintrin.h>
-
-typedef __m128 metroi_v4;
-METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return _mm_loadu_ps(p); }
-METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { _mm_storeu_ps(p, a); }
-METROI_INLINE metroi_v4 metroi_v4_all(float x) { return _mm_set1_ps(x); }
-METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return _mm_add_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return _mm_sub_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return _mm_mul_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return _mm_div_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return _mm_min_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return _mm_max_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return _mm_cmple_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b) { return _mm_and_ps(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b) { return _mm_or_ps(a, b); }
-METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a) { return (unsigned)_mm_movemask_ps(a); }
-
-#elif !defined(METRO_NO_SIMD) && defined(__GNUC__) && defined(__aarch64__) && defined(__ARM_NEON)
-#define METROI_SIMD
-#include <arm_neon.h>
-
-typedef float32x4_t metroi_v4;
-METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return vld1q_f32(p); }
-METROI_INLINE void metroi_v4_store(float *p, metroi_v4 a) { vst1q_f32(p, a); }
-METROI_INLINE metroi_v4 metroi_v4_all(float x) { return vdupq_n_f32(x); }
-METROI_INLINE metroi_v4 metroi_v4_add(metroi_v4 a, metroi_v4 b) { return vaddq_f32(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_sub(metroi_v4 a, metroi_v4 b) { return vsubq_f32(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_mul(metroi_v4 a, metroi_v4 b) { return vmulq_f32(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_div(metroi_v4 a, metroi_v4 b) { return vdivq_f32(a, b); }
-METROI_INLINE metroi_v4 metroi_v4_low(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcltq_f32(a, b), a, b); }
-METROI_INLINE metroi_v4 metroi_v4_high(metroi_v4 a, metroi_v4 b) { return vbslq_f32(vcgtq_f32(a, b), a, b); }
-METROI_INLINE metroi_v4 metroi_v4_le(metroi_v4 a, metroi_v4 b) { return vreinterpretq_f32_u32(vcleq_f32(a, b)); }
-METROI_INLINE metroi_v4 metroi_v4_and(metroi_v4 a, metroi_v4 b)
-{
-    return vreinterpretq_f32_u32(vandq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
-}
-METROI_INLINE metroi_v4 metroi_v4_or(metroi_v4 a, metroi_v4 b)
-{
-    return vreinterpretq_f32_u32(vorrq_u32(vreinterpretq_u32_f32(a), vreinterpretq_u32_f32(b)));
-}
-METROI_INLINE unsigned metroi_v4_mask(metroi_v4 a)
-{
-    static const uint32_t bit[4] = { 1, 2, 4, 8 };
-    return vaddvq_u32(vandq_u32(vreinterpretq_u32_f32(a), vld1q_u32(bit)));
-}
-#endif
+   The functions below are the tests above with the same operations in the same order, four boxes or triangles at a
+   time. Where there are no such instructions the plain functions do the work. */
 
 #ifdef METROI_SIMD
-/* The ray's numbers in all four lanes, spread once a ray. `row` is where a triangle's x, y, z are in a block. */
+/* What boxes need of the ray in all four lanes, spread once a ray. */
 typedef struct {
-    metroi_v4 origin[3], inverse[3], padded[3]; /* for boxes */
-    metroi_v4 start[3], shear[2], side;         /* for triangles, in the order of `axis` */
-    metroi_v4 reach[3], spare[3];
-    size_t near_row[3], far_row[3], row[3];
+    metroi_v4 origin[3], inverse[3], padded[3];
+    size_t row[6];
 } metroi_ray4;
 
 METROI_INLINE void metroi_ray4_axis(const metroi_ray *ray, int k, metroi_ray4 *s)
 {
-    int axis = ray->axis[k];
     s->origin[k] = metroi_v4_all(ray->origin[k]);
     s->inverse[k] = metroi_v4_all(ray->inverse[k]);
     s->padded[k] = metroi_v4_all(ray->inverse[k] * METROI_PAD_NODE);
-    s->start[k] = metroi_v4_all(ray->origin[axis]);
-    s->reach[k] = metroi_v4_all(ray->reach[axis]);
-    s->spare[k] = metroi_v4_all(ray->spare[axis]);
-    s->near_row[k] = ray->near_row[k];
-    s->far_row[k] = ray->far_row[k];
-    s->row[k] = 4 * (size_t)axis;
-}
-
-METROI_INLINE void metroi_ray4_make(const metroi_ray *ray, metroi_ray4 *s)
-{
-    metroi_ray4_axis(ray, 0, s);
-    metroi_ray4_axis(ray, 1, s);
-    metroi_ray4_axis(ray, 2, s);
-    s->shear[0] = metroi_v4_all(ray->shear[0]);
-    s->shear[1] = metroi_v4_all(ray->shear[1]);
-    s->side = metroi_v4_all(ray->side);
+    s->row[k] = ray->row[k];
+    s->row[k + 3] = ray->row[k + 3];
 }
 
 METROI_INLINE metroi_v4 metroi_v4_plane(const float *row, metroi_v4 origin, metroi_v4 inverse)
@@ -11785,12 +11797,12 @@ METROI_INLINE metroi_v4 metroi_v4_plane(const float *row, metroi_v4 origin, metr
 METROI_INLINE unsigned metroi_boxes_half(const float *row, const metroi_ray *ray, const metroi_ray4 *s, float *near_t)
 {
     metroi_v4 n = metroi_v4_all(ray->t_min), f = metroi_v4_all(ray->t); /* eq 10.5 */
-    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[0], s->origin[0], s->inverse[0]), n);
-    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[0], s->origin[0], s->padded[0]), f);
-    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[1], s->origin[1], s->inverse[1]), n);
-    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[1], s->origin[1], s->padded[1]), f);
-    n = metroi_v4_high(metroi_v4_plane(row + s->near_row[2], s->origin[2], s->inverse[2]), n);
-    f = metroi_v4_low(metroi_v4_plane(row + s->far_row[2], s->origin[2], s->padded[2]), f);
+    n = metroi_v4_high(metroi_v4_plane(row + s->row[0], s->origin[0], s->inverse[0]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->row[3], s->origin[0], s->padded[0]), f);
+    n = metroi_v4_high(metroi_v4_plane(row + s->row[1], s->origin[1], s->inverse[1]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->row[4], s->origin[1], s->padded[1]), f);
+    n = metroi_v4_high(metroi_v4_plane(row + s->row[2], s->origin[2], s->inverse[2]), n);
+    f = metroi_v4_low(metroi_v4_plane(row + s->row[5], s->origin[2], s->padded[2]), f);
     metroi_v4_store(near_t, n);
     return metroi_v4_mask(metroi_v4_le(n, f));
 }
@@ -11814,65 +11826,70 @@ METROI_INLINE metroi_v4 metroi_v4_edge(metroi_v4 px, metroi_v4 py, metroi_v4 qx,
 }
 
 /* As metroi_box_widen and metroi_own_box, for those of four triangles that are `in`: all ones where it is met. */
-METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ray, const metroi_ray4 *s, metroi_v4 in,
-                                          metroi_v4 *enter)
+METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ray, metroi_v4 in, metroi_v4 *enter)
 {
-    metroi_v4 lo[3], hi[3], largest = metroi_v4_all(0), margin, a, b, c, met;
+    metroi_v4 lo[3], hi[3], origin[3], reach[3], spare[3], margin, a, b, c, met;
+    metroi_v4 zero = metroi_v4_all(0), largest = zero;
     metroi_v4 begin = metroi_v4_all(ray->t_min), near_t = begin, far_t = metroi_v4_all(ray->t), leave = far_t;
     int k;
     *enter = begin;
     for (k = 0; k < 3; k++) {
-        const float *p = row + s->row[k];
+        const float *p = row + 4 * k;
         a = metroi_v4_load(p);
         b = metroi_v4_load(p + 12);
         c = metroi_v4_load(p + 24);
         lo[k] = metroi_v4_low(metroi_v4_low(a, b), c);
         hi[k] = metroi_v4_high(metroi_v4_high(a, b), c);
-        a = metroi_v4_mul(metroi_v4_sub(lo[k], s->start[k]), s->reach[k]);
-        b = metroi_v4_mul(metroi_v4_sub(hi[k], s->start[k]), s->reach[k]);
+        origin[k] = metroi_v4_all(ray->origin[k]);
+        reach[k] = metroi_v4_all(ray->reach[k]);
+        spare[k] = metroi_v4_all(ray->spare[k]);
+        a = metroi_v4_mul(metroi_v4_sub(lo[k], origin[k]), reach[k]);
+        b = metroi_v4_mul(metroi_v4_sub(hi[k], origin[k]), reach[k]);
         *enter = metroi_v4_high(metroi_v4_low(a, b), *enter);
-        leave = metroi_v4_low(metroi_v4_add(metroi_v4_high(a, b), s->spare[k]), leave);
+        leave = metroi_v4_low(metroi_v4_add(metroi_v4_high(a, b), spare[k]), leave);
     }
     in = metroi_v4_and(in, metroi_v4_le(begin, leave));
     met = metroi_v4_and(in, metroi_v4_le(*enter, leave));
     if (metroi_v4_mask(met) == metroi_v4_mask(in)) return met;
     for (k = 0; k < 3; k++)
-        largest = metroi_v4_high(metroi_v4_high(hi[k], metroi_v4_sub(metroi_v4_all(0), lo[k])), largest);
+        largest = metroi_v4_high(metroi_v4_high(hi[k], metroi_v4_sub(zero, lo[k])), largest);
     margin = metroi_v4_mul(largest, metroi_v4_all(METROI_MARGIN));
     for (k = 0; k < 3; k++) { /* eq 10.5 */
-        a = metroi_v4_mul(metroi_v4_sub(metroi_v4_sub(lo[k], margin), s->start[k]), s->reach[k]);
-        b = metroi_v4_mul(metroi_v4_sub(metroi_v4_add(hi[k], margin), s->start[k]), s->reach[k]);
+        a = metroi_v4_mul(metroi_v4_sub(metroi_v4_sub(lo[k], margin), origin[k]), reach[k]);
+        b = metroi_v4_mul(metroi_v4_sub(metroi_v4_add(hi[k], margin), origin[k]), reach[k]);
         near_t = metroi_v4_high(metroi_v4_low(a, b), near_t);
         b = metroi_v4_mul(metroi_v4_high(a, b), metroi_v4_all(METROI_PAD));
-        far_t = metroi_v4_low(metroi_v4_add(b, s->spare[k]), far_t);
+        far_t = metroi_v4_low(metroi_v4_add(b, spare[k]), far_t);
     }
     return metroi_v4_or(met, metroi_v4_and(in, metroi_v4_le(near_t, far_t)));
 }
 
-METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi_ray *ray, const void *spread,
-                                         metroi_lanes *lanes)
+METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi_ray *ray, metroi_lanes *lanes)
 {
-    const metroi_ray4 *s = (const metroi_ray4 *)spread;
-    const float *row = block->corner[0][0], *px = row + s->row[0], *py = row + s->row[1], *pz = row + s->row[2];
-    metroi_v4 az = metroi_v4_sub(metroi_v4_load(pz), s->start[2]);
-    metroi_v4 bz = metroi_v4_sub(metroi_v4_load(pz + 12), s->start[2]);
-    metroi_v4 cz = metroi_v4_sub(metroi_v4_load(pz + 24), s->start[2]);
-    metroi_v4 ax = metroi_v4_shear(px, s->start[0], s->shear[0], az);
-    metroi_v4 ay = metroi_v4_shear(py, s->start[1], s->shear[1], az);
-    metroi_v4 bx = metroi_v4_shear(px + 12, s->start[0], s->shear[0], bz);
-    metroi_v4 by = metroi_v4_shear(py + 12, s->start[1], s->shear[1], bz);
-    metroi_v4 cx = metroi_v4_shear(px + 24, s->start[0], s->shear[0], cz);
-    metroi_v4 cy = metroi_v4_shear(py + 24, s->start[1], s->shear[1], cz);
+    const size_t *axis = ray->axis;
+    const float *row = block->corner[0][0], *px = row + 4 * axis[0], *py = row + 4 * axis[1], *pz = row + 4 * axis[2];
+    metroi_v4 ox = metroi_v4_all(ray->origin[axis[0]]), sx = metroi_v4_all(ray->shear[0]);
+    metroi_v4 oy = metroi_v4_all(ray->origin[axis[1]]), sy = metroi_v4_all(ray->shear[1]);
+    metroi_v4 oz = metroi_v4_all(ray->origin[axis[2]]);
+    metroi_v4 az = metroi_v4_sub(metroi_v4_load(pz), oz);
+    metroi_v4 bz = metroi_v4_sub(metroi_v4_load(pz + 12), oz);
+    metroi_v4 cz = metroi_v4_sub(metroi_v4_load(pz + 24), oz);
+    metroi_v4 ax = metroi_v4_shear(px, ox, sx, az);
+    metroi_v4 ay = metroi_v4_shear(py, oy, sy, az);
+    metroi_v4 bx = metroi_v4_shear(px + 12, ox, sx, bz);
+    metroi_v4 by = metroi_v4_shear(py + 12, oy, sy, bz);
+    metroi_v4 cx = metroi_v4_shear(px + 24, ox, sx, cz);
+    metroi_v4 cy = metroi_v4_shear(py + 24, oy, sy, cz);
     metroi_v4 U = metroi_v4_edge(bx, by, cx, cy), V = metroi_v4_edge(cx, cy, ax, ay);
     metroi_v4 W = metroi_v4_edge(ax, ay, bx, by), det = metroi_v4_add(metroi_v4_add(U, V), W), T, t, in;
     metroi_v4 zero = metroi_v4_all(0), n = metroi_v4_all(ray->t_min), f = metroi_v4_all(ray->t);
     in = metroi_v4_or(metroi_v4_le(zero, metroi_v4_low(metroi_v4_low(U, V), W)),
                       metroi_v4_le(metroi_v4_high(metroi_v4_high(U, V), W), zero));
     T = metroi_v4_add(metroi_v4_add(metroi_v4_mul(U, az), metroi_v4_mul(V, bz)), metroi_v4_mul(W, cz));
-    t = metroi_v4_div(metroi_v4_mul(T, s->side), det); /* eq 10.8 */
+    t = metroi_v4_div(metroi_v4_mul(T, metroi_v4_all(ray->side)), det); /* eq 10.8 */
     in = metroi_v4_and(in, metroi_v4_and(metroi_v4_le(n, t), metroi_v4_le(t, f)));
     if (metroi_v4_mask(in) == 0) return 0;
-    in = metroi_v4_own_box(row, ray, s, in, &n);
+    in = metroi_v4_own_box(row, ray, in, &n);
     t = metroi_v4_high(t, n); /* eq 10.9 */
     metroi_v4_store(lanes->t, t);
     metroi_v4_store(lanes->v, V);
@@ -11898,17 +11915,32 @@ METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi
 
 #ifdef METROI_AVX2
 typedef struct {
-    metroi_ray4 four;
     __m256 inverse[3], enter[3], leave[3];
+    size_t row[6];
 } metroi_ray8;
 
-METROI_AVX2 METROI_INLINE void metroi_ray8_axis(const metroi_ray *ray, int k, metroi_ray8 *s)
+METROI_AVX2 METROI_INLINE void metroi_v8_spread(metroi_v4 a, __m256 spread[3])
 {
-    float r = metroi_low(metroi_high(ray->inverse[k], -1e30f), 1e30f), shift = ray->origin[k] * r;
-    float margin = (fabsf(shift) + fabsf(r)) * 2.4e-7f + 3e-5f;
-    s->inverse[k] = _mm256_set1_ps(r);
-    s->enter[k] = _mm256_set1_ps(shift + margin);
-    s->leave[k] = _mm256_set1_ps(shift - margin);
+    float lane[4];
+    metroi_v4_store(lane, a);
+    spread[0] = _mm256_set1_ps(lane[0]);
+    spread[1] = _mm256_set1_ps(lane[1]);
+    spread[2] = _mm256_set1_ps(lane[2]);
+}
+
+METROI_AVX2 METROI_INLINE void metroi_ray8_make(const metroi_ray *ray, metroi_ray8 *s)
+{
+    metroi_v4 zero = metroi_v4_all(0), one = metroi_v4_all(1), o = metroi_v4_load(ray->origin), r, shift, margin;
+    r = metroi_v4_low(metroi_v4_high(metroi_v4_load(ray->inverse), metroi_v4_all(-1e30f)), metroi_v4_all(1e30f));
+    margin = metroi_v4_add(metroi_v4_high(o, metroi_v4_sub(zero, o)), one);
+    margin = metroi_v4_mul(metroi_v4_mul(margin, metroi_v4_all(2.4e-7f)), metroi_v4_high(r, metroi_v4_sub(zero, r)));
+    margin = metroi_v4_add(margin, metroi_v4_all(3e-5f));
+    shift = metroi_v4_mul(o, r);
+    metroi_v8_spread(r, s->inverse);
+    metroi_v8_spread(metroi_v4_add(shift, margin), s->enter);
+    metroi_v8_spread(metroi_v4_sub(shift, margin), s->leave);
+    s->row[0] = ray->row[0], s->row[1] = ray->row[1], s->row[2] = ray->row[2];
+    s->row[3] = ray->row[3], s->row[4] = ray->row[4], s->row[5] = ray->row[5];
 }
 
 METROI_AVX2 METROI_INLINE __m256 metroi_v8_plane(const float *row, __m256 inverse, __m256 shift)
@@ -11920,15 +11952,14 @@ METROI_AVX2 METROI_INLINE unsigned metroi_boxes_eight(const metroi_node *node, c
                                                       const void *spread, float near_t[8])
 {
     const metroi_ray8 *s = (const metroi_ray8 *)spread;
-    const size_t *near_row = s->four.near_row, *far_row = s->four.far_row;
-    const float *row = node->bound;
+    const float *bound = node->bound;
     __m256 n = _mm256_set1_ps(ray->t_min), f = _mm256_set1_ps(ray->t); /* eq 10.10 */
-    n = _mm256_max_ps(metroi_v8_plane(row + near_row[0], s->inverse[0], s->enter[0]), n);
-    f = _mm256_min_ps(metroi_v8_plane(row + far_row[0], s->inverse[0], s->leave[0]), f);
-    n = _mm256_max_ps(metroi_v8_plane(row + near_row[1], s->inverse[1], s->enter[1]), n);
-    f = _mm256_min_ps(metroi_v8_plane(row + far_row[1], s->inverse[1], s->leave[1]), f);
-    n = _mm256_max_ps(metroi_v8_plane(row + near_row[2], s->inverse[2], s->enter[2]), n);
-    f = _mm256_min_ps(metroi_v8_plane(row + far_row[2], s->inverse[2], s->leave[2]), f);
+    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[0], s->inverse[0], s->enter[0]), n);
+    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[3], s->inverse[0], s->leave[0]), f);
+    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[1], s->inverse[1], s->enter[1]), n);
+    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[4], s->inverse[1], s->leave[1]), f);
+    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[2], s->inverse[2], s->enter[2]), n);
+    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[5], s->inverse[2], s->leave[2]), f);
     _mm256_storeu_ps(near_t, n);
     return (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(n, f, _CMP_LE_OQ));
 }
@@ -12003,8 +12034,7 @@ METROI_INLINE uint32_t metroi_children_sort(const uint32_t *child, const float *
 
 typedef unsigned (*metroi_boxes_test)(const metroi_node *node, const metroi_ray *ray, const void *spread,
                                       float near_t[8]);
-typedef unsigned (*metroi_block_test)(const metroi_block *block, const metroi_ray *ray, const void *spread,
-                                      metroi_lanes *lanes);
+typedef unsigned (*metroi_block_test)(const metroi_block *block, const metroi_ray *ray, metroi_lanes *lanes);
 
 /* The two tests are arguments that are known where this is inlined, so that they are inlined in turn: one walk stands
    for all. `any` asks for any hit. */
@@ -12030,7 +12060,7 @@ METROI_INLINE void metroi_walk(const metroi_bvh *bvh, metroi_ray *ray, int any, 
         if (at & METROI_LEAF) {
             const metroi_block *block = bvh->blocks + ((at & ~METROI_LEAF) >> 1), *end = block + 1 + (at & 1);
             for (; block < end; block++) {
-                mask = triangles(block, ray, spread, &lanes);
+                mask = triangles(block, ray, &lanes);
                 if (mask != 0) metroi_ray_take(ray, block, &lanes, mask);
                 if (any && ray->triangle != METROI_NONE) return;
             }
@@ -12053,7 +12083,9 @@ static void metroi_walk_plain(const metroi_bvh *bvh, metroi_ray *ray, int any)
 static void metroi_walk_four(const metroi_bvh *bvh, metroi_ray *ray, int any)
 {
     metroi_ray4 spread;
-    metroi_ray4_make(ray, &spread);
+    metroi_ray4_axis(ray, 0, &spread);
+    metroi_ray4_axis(ray, 1, &spread);
+    metroi_ray4_axis(ray, 2, &spread);
     if (any) metroi_walk(bvh, ray, 1, metroi_boxes_four, metroi_block_four, &spread);
     else metroi_walk(bvh, ray, 0, metroi_boxes_four, metroi_block_four, &spread);
 }
@@ -12063,12 +12095,9 @@ static void metroi_walk_four(const metroi_bvh *bvh, metroi_ray *ray, int any)
 METROI_AVX2 static void metroi_walk_eight(const metroi_bvh *bvh, metroi_ray *ray, int any)
 {
     metroi_ray8 spread;
-    metroi_ray4_make(ray, &spread.four);
-    metroi_ray8_axis(ray, 0, &spread);
-    metroi_ray8_axis(ray, 1, &spread);
-    metroi_ray8_axis(ray, 2, &spread);
-    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_eight, metroi_block_four, &spread.four);
-    else metroi_walk(bvh, ray, 0, metroi_boxes_eight, metroi_block_four, &spread.four);
+    metroi_ray8_make(ray, &spread);
+    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_eight, metroi_block_four, &spread);
+    else metroi_walk(bvh, ray, 0, metroi_boxes_eight, metroi_block_four, &spread);
 }
 #endif
 
@@ -12187,6 +12216,7 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
 #undef METROI_MARGIN
 #undef METROI_PAD
 #undef METROI_PAD_NODE
+#undef METROI_REACH
 #undef METROI_AVX2
 #undef METROI_SIMD
 

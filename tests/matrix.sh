@@ -81,7 +81,7 @@ for compiler in gcc clang; do
         later "$compiler -std=$standard" "$compiler -std=$standard $strict_c -O2 -c -o /dev/null $work/all.c"
     done
     later "$compiler static, twice, after min and max" "$compiler -std=c99 $strict_c -O2 -c -o /dev/null $work/static.c"
-    for option in METRO_NO_THREADS METRO_NO_TRACER; do
+    for option in METRO_NO_THREADS METRO_NO_TRACER METRO_NO_SIMD; do
         later "$compiler -D$option" "$compiler -std=c99 $strict_c -D$option -O2 -c -o /dev/null $work/all.c"
     done
     later "$compiler -O3 -march=native" "$compiler -std=gnu99 $strict_c -O3 -march=native -c -o /dev/null $work/all.c"

@@ -131,7 +131,7 @@ static int loop_hit(const metro_scene *scene, metro_vec3 o, metro_vec3 d, double
     size_t i;
     if (!metroi_ray_make(bvh, o, d, t_min, t_max, &ray)) return 0;
     for (i = 0; i < bvh->block_count; i++) {
-        unsigned mask = metroi_block_plain(&bvh->blocks[i], &ray, NULL, &lanes);
+        unsigned mask = metroi_block_plain(&bvh->blocks[i], &ray, &lanes);
         if (mask != 0) metroi_ray_take(&ray, &bvh->blocks[i], &lanes, mask);
     }
     if (ray.triangle == UINT32_MAX) return 0;
@@ -404,6 +404,9 @@ static void nothing_to_hit(void)
     CHECK(!hit_all(&scene, vec(0, NAN, 0), vec(0, 0, 1), 0, INFINITY, &hit), "hit from NaN");
     CHECK(!hit_all(&scene, vec(INFINITY, 0, 0), vec(0, 0, 1), 0, INFINITY, &hit), "hit from infinity");
     CHECK(!hit_all(&scene, vec(0, 0, 0), vec(NAN, 0, 1), 0, INFINITY, &hit), "hit along NaN");
+    CHECK(!hit_all(&scene, vec(0, 0, 0), vec(0, NAN, 1), 0, INFINITY, &hit), "hit along NaN");
+    CHECK(!hit_all(&scene, vec(0, 0, 0), vec(NAN, NAN, 1), 0, INFINITY, &hit), "hit along two NaN");
+    CHECK(!hit_all(&scene, vec(0, 0, 0), vec(0, 0, NAN), 0, INFINITY, &hit), "hit along NaN");
     CHECK(!hit_all(&scene, vec(0, 0, 0), vec(0, 0, INFINITY), 0, INFINITY, &hit), "hit along infinity");
     CHECK(!hit_all(&scene, vec(0, 0, 0), vec(0, 0, 1), NAN, INFINITY, &hit), "hit after NaN");
     CHECK(!hit_all(&scene, vec(0, 0, 0), vec(0, 0, 1), 0, NAN, &hit), "hit before NaN");
