@@ -1637,6 +1637,17 @@ METRO_API void metro_bundles_free(metro_bundles *bundles);
 extern "C" {
 #endif
 
+/* A lesson is compiled more often than it is run for long. So gcc is held to -O1 between METROI_COLD and METROI_WARM,
+   where it would do more: `make bench` finds nothing slower. What is compiled without optimization stays so. */
+
+#if defined(__GNUC__) && !defined(__clang__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
+#define METROI_COLD _Pragma("GCC push_options") _Pragma("GCC optimize(\"O1\")")
+#define METROI_WARM _Pragma("GCC pop_options")
+#else
+#define METROI_COLD
+#define METROI_WARM
+#endif
+
 /* # 1 Ground
 
    Everything above stands on three small things: a way to say that something failed, vectors, and a way to use many
@@ -3535,15 +3546,7 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
     return metro_moments_mean(&chain->normalisation);
 }
 
-/* A lesson is compiled more often than it is run for long, so gcc is held to -O1 in chapters 5 to 8, where it would
-   do more: `make bench` finds them no slower. What is compiled without optimization stays so. */
-
-#if defined(__GNUC__) && !defined(__clang__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
-#define METROI_COMPILE_FAST
-#pragma GCC push_options
-#pragma GCC optimize("O1")
-#endif
-
+METROI_COLD
 /* # 5 Start-up theory
 
    A Metropolis chain needs no knowledge of its target to start, and pays for that at the start: its first samples lie
@@ -9270,13 +9273,10 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
    most twice the digits of a float and a size between 1e-90 and 1e78, so its square neither overflows nor vanishes,
    and no scaling is needed.
 
-   These small functions are asked at every hit, so they are compiled as fast as the rest of the program, and what is
-   METROI_INLINE is inlined wherever it is used: vectors then stay in registers, which makes the walks of chapter 12
-   up to a tenth faster. */
+   These small functions are asked at every hit, and what is METROI_INLINE is inlined where it is used. Vectors then
+   stay in registers, which makes the walks of chapter 12 up to a tenth faster. */
 
-#ifdef METROI_COMPILE_FAST
-#pragma GCC pop_options
-#endif
+METROI_WARM
 #if defined(__GNUC__) || defined(__clang__)
 #define METROI_INLINE __attribute__((always_inline)) static inline
 #else
@@ -9339,10 +9339,7 @@ static const metro_material *metroi_scene_material(const metro_scene *scene, uin
     return material == 0 ? &plain : &scene->material[material - 1];
 }
 
-#ifdef METROI_COMPILE_FAST
-#pragma GCC push_options
-#pragma GCC optimize("O1")
-#endif
+METROI_COLD
 
 /* The faces that these show to a user know the borders of their lists. */
 
@@ -10718,10 +10715,7 @@ METRO_API metro_result metro_scene_parse_obj(metro_scene *scene, const unsigned 
 }
 
 #endif /* METRO_NO_TRACER */
-#ifdef METROI_COMPILE_FAST
-#pragma GCC pop_options
-#undef METROI_COMPILE_FAST
-#endif
+METROI_WARM
 #ifndef METRO_NO_TRACER
 
 /* # 10 BVH
@@ -11021,6 +11015,8 @@ static void metroi_range_split(metroi_item *item, const metroi_range *range, con
     }
     right->first = end;
 }
+
+METROI_COLD
 
 /* # 10.3 From two children to eight
 
@@ -11359,6 +11355,8 @@ METRO_API void metro_scene_free(metro_scene *scene)
     memset(scene, 0, sizeof *scene);
 }
 
+METROI_WARM
+
 /* # 10.6 Rays and boxes
 
    The tests below must give the same bits wherever they are compiled, or a ray slips through where one triangle
@@ -11380,7 +11378,7 @@ METRO_API void metro_scene_free(metro_scene *scene)
 #if !defined(METRO_NO_SIMD) && defined(__GNUC__) && !defined(__TINYC__) && defined(__SSE2__)
 #define METROI_SIMD
 #define METROI_AVX2 __attribute__((target("avx2,bmi,fma")))
-#include <immintrin.h>
+#include <emmintrin.h>
 
 typedef __m128 metroi_v4;
 METROI_INLINE metroi_v4 metroi_v4_load(const float *p) { return _mm_loadu_ps(p); }
@@ -11901,31 +11899,64 @@ METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi
 
 /* With AVX2 the eight boxes of a node are one instruction at a time, which saves a tenth of the time. The program
    asks the processor when it runs, so nothing is asked of the compiler's options: the attribute permits the
-   instructions in one function.
+   instructions in one function. gcc knows them by names of its own, and so does without the header of their common
+   names, which would take a tenth as long to compile as all of this one.
 
    A box need not be tested in the order of 10.6: it only must not be missed where 10.7 would accept a triangle in it.
    So here the product and the difference of eq 10.5 are one fused instruction,
 
        t_near = max_k (n_k r_k - (o_k r_k + m_k)),    t_far = min_k (f_k r_k - (o_k r_k - m_k))             (10.10)
 
-   with $r_k = 1/d_k$, and its subtrahends are computed once a ray. The margin $m_k$ covers what rounding does: the
-   product $o_k r_k$ and the sums are off by 2^-24 of themselves, and times up to 16 differ between the two forms by
-   16 times 1.5e-6, the larger of the two pads. Infinities would turn to NaN here, so $r_k$ is at most 1e30; and
-   2.4e-7 of it in the margin keeps every box that is within that distance of a ray which runs along a plane. */
+   with $r_k = 1/d_k$, and what does not depend on the box is computed once a ray. The margin $m_k$ covers what
+   rounding does: the product $o_k r_k$ and the sums are off by 2^-24 of themselves, and times up to 16 differ between
+   the two forms by 16 times 1.5e-6, the larger of the two pads. Infinities would turn to NaN here, so $r_k$ is at
+   most 1e30; and 2.4e-7 of it in the margin keeps every box that is within that distance of a ray which runs along a
+   plane. */
 
 #ifdef METROI_AVX2
+#ifdef __clang__
+#include <immintrin.h>
+#define METROI_V8(common, own) common
+#else
+#define METROI_V8(common, own) own
+#endif
+typedef float metroi_v8 __attribute__((vector_size(32)));
+typedef float metroi_v8_anywhere __attribute__((vector_size(32), aligned(4), may_alias));
+
+METROI_AVX2 METROI_INLINE metroi_v8 metroi_v8_low(metroi_v8 a, metroi_v8 b)
+{
+    return METROI_V8(_mm256_min_ps, __builtin_ia32_minps256)(a, b);
+}
+
+METROI_AVX2 METROI_INLINE metroi_v8 metroi_v8_high(metroi_v8 a, metroi_v8 b)
+{
+    return METROI_V8(_mm256_max_ps, __builtin_ia32_maxps256)(a, b);
+}
+
+METROI_AVX2 METROI_INLINE unsigned metroi_v8_le(metroi_v8 a, metroi_v8 b)
+{
+    metroi_v8 less = METROI_V8(_mm256_cmp_ps, __builtin_ia32_cmpps256)(a, b, 18); /* or equal, and no NaN */
+    return (unsigned)METROI_V8(_mm256_movemask_ps, __builtin_ia32_movmskps256)(less);
+}
+
+METROI_AVX2 METROI_INLINE metroi_v8 metroi_v8_all(float x)
+{
+    metroi_v8 all = { x, x, x, x, x, x, x, x };
+    return all;
+}
+
 typedef struct {
-    __m256 inverse[3], enter[3], leave[3];
+    metroi_v8 inverse[3], enter[3], leave[3];
     size_t row[6];
 } metroi_ray8;
 
-METROI_AVX2 METROI_INLINE void metroi_v8_spread(metroi_v4 a, __m256 spread[3])
+METROI_AVX2 METROI_INLINE void metroi_v8_spread(metroi_v4 a, metroi_v8 spread[3])
 {
     float lane[4];
     metroi_v4_store(lane, a);
-    spread[0] = _mm256_set1_ps(lane[0]);
-    spread[1] = _mm256_set1_ps(lane[1]);
-    spread[2] = _mm256_set1_ps(lane[2]);
+    spread[0] = metroi_v8_all(lane[0]);
+    spread[1] = metroi_v8_all(lane[1]);
+    spread[2] = metroi_v8_all(lane[2]);
 }
 
 METROI_AVX2 METROI_INLINE void metroi_ray8_make(const metroi_ray *ray, metroi_ray8 *s)
@@ -11937,15 +11968,15 @@ METROI_AVX2 METROI_INLINE void metroi_ray8_make(const metroi_ray *ray, metroi_ra
     margin = metroi_v4_add(margin, metroi_v4_all(3e-5f));
     shift = metroi_v4_mul(o, r);
     metroi_v8_spread(r, s->inverse);
-    metroi_v8_spread(metroi_v4_add(shift, margin), s->enter);
-    metroi_v8_spread(metroi_v4_sub(shift, margin), s->leave);
+    metroi_v8_spread(metroi_v4_sub(metroi_v4_sub(zero, shift), margin), s->enter);
+    metroi_v8_spread(metroi_v4_sub(margin, shift), s->leave);
     s->row[0] = ray->row[0], s->row[1] = ray->row[1], s->row[2] = ray->row[2];
     s->row[3] = ray->row[3], s->row[4] = ray->row[4], s->row[5] = ray->row[5];
 }
 
-METROI_AVX2 METROI_INLINE __m256 metroi_v8_plane(const float *row, __m256 inverse, __m256 shift)
+METROI_AVX2 METROI_INLINE metroi_v8 metroi_v8_plane(const float *row, metroi_v8 inverse, metroi_v8 shift)
 {
-    return _mm256_fmsub_ps(_mm256_loadu_ps(row), inverse, shift);
+    return METROI_V8(_mm256_fmadd_ps, __builtin_ia32_vfmaddps256)(*(const metroi_v8_anywhere *)row, inverse, shift);
 }
 
 METROI_AVX2 METROI_INLINE unsigned metroi_boxes_eight(const metroi_node *node, const metroi_ray *ray,
@@ -11953,15 +11984,15 @@ METROI_AVX2 METROI_INLINE unsigned metroi_boxes_eight(const metroi_node *node, c
 {
     const metroi_ray8 *s = (const metroi_ray8 *)spread;
     const float *bound = node->bound;
-    __m256 n = _mm256_set1_ps(ray->t_min), f = _mm256_set1_ps(ray->t); /* eq 10.10 */
-    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[0], s->inverse[0], s->enter[0]), n);
-    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[3], s->inverse[0], s->leave[0]), f);
-    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[1], s->inverse[1], s->enter[1]), n);
-    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[4], s->inverse[1], s->leave[1]), f);
-    n = _mm256_max_ps(metroi_v8_plane(bound + s->row[2], s->inverse[2], s->enter[2]), n);
-    f = _mm256_min_ps(metroi_v8_plane(bound + s->row[5], s->inverse[2], s->leave[2]), f);
-    _mm256_storeu_ps(near_t, n);
-    return (unsigned)_mm256_movemask_ps(_mm256_cmp_ps(n, f, _CMP_LE_OQ));
+    metroi_v8 n = metroi_v8_all(ray->t_min), f = metroi_v8_all(ray->t); /* eq 10.10 */
+    n = metroi_v8_high(metroi_v8_plane(bound + s->row[0], s->inverse[0], s->enter[0]), n);
+    f = metroi_v8_low(metroi_v8_plane(bound + s->row[3], s->inverse[0], s->leave[0]), f);
+    n = metroi_v8_high(metroi_v8_plane(bound + s->row[1], s->inverse[1], s->enter[1]), n);
+    f = metroi_v8_low(metroi_v8_plane(bound + s->row[4], s->inverse[1], s->leave[1]), f);
+    n = metroi_v8_high(metroi_v8_plane(bound + s->row[2], s->inverse[2], s->enter[2]), n);
+    f = metroi_v8_low(metroi_v8_plane(bound + s->row[5], s->inverse[2], s->leave[2]), f);
+    *(metroi_v8_anywhere *)near_t = n;
+    return metroi_v8_le(n, f);
 }
 #endif
 
@@ -12218,6 +12249,7 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
 #undef METROI_PAD_NODE
 #undef METROI_REACH
 #undef METROI_AVX2
+#undef METROI_V8
 #undef METROI_SIMD
 
 /* # 11 Light
@@ -13617,6 +13649,8 @@ static double metroi_propose_way(const double *from, double *to, metro_rng *rng,
     return 1;
 }
 
+METROI_COLD
+
 /* # 13.3 A pilot picture
 
    A chain whose importance is the luminance spends its samples where the picture is bright, and the eye asks for the
@@ -13751,6 +13785,8 @@ static metro_result metroi_pilot_run(metroi_metropolis *plan)
     metroi_canvas_free(&canvas);
     return result;
 }
+
+METROI_WARM
 
 /* # 13.4 Chains in rounds
 
@@ -13960,6 +13996,8 @@ static metro_result metroi_chains_make(metroi_metropolis *plan, double fov)
     if (!options->all_connections || !options->one_stage) result = metroi_pilot_run(plan);
     return result == METRO_OK ? metroi_primary_axes(plan, options->perturbation) : result;
 }
+
+METROI_COLD
 
 /* # 13.5 How bright
 
@@ -14477,6 +14515,8 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
     metroi_report_warn(render, report);
 }
 
+METROI_WARM
+
 /* # 14 Ray bundles
 
    The methods so far follow one path at a time. Lines that cross the whole scene, each of which moves light between
@@ -14497,6 +14537,8 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
 
    where $A(i, j, omega')$ is the projected area of patch $j$ that patch $i$ sees in direction omega'. It is the
    equation of the whole scene, not of a point, and each matrix A is one bundle. */
+
+METROI_COLD
 
 /* # 14.1 Patches
 
@@ -14624,6 +14666,8 @@ METRO_API size_t metro_patches_at(const metro_patches *patches, uint32_t triangl
     metroi_patch_place(u * (double)n, v * (double)n, n, &i, &j, &k);
     return patches->first[triangle] + metroi_patch_number(n, i, j, k);
 }
+
+METROI_WARM
 
 /* # 14.2 A bundle
 
@@ -15192,6 +15236,8 @@ static void metroi_sweep(metroi_bundle *bundle, int whole_lines)
     }
 }
 
+METROI_COLD
+
 /* # 14.4 Fragments
 
    The plain way, to check the sweep by: each patch leaves a fragment, its number and its depth, on each line that
@@ -15550,6 +15596,8 @@ METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro
     return METRO_OK;
 }
 
+METROI_WARM
+
 /* # 14.7 Walks
 
    A walk is a list of D directions. Along the first one all patches send their emission. Along the k-th they send
@@ -15780,6 +15828,8 @@ static void metroi_bundles_walk(metroi_batch *batch, const double *z, metro_rng 
     batch->bundles += d;
 }
 
+METROI_COLD
+
 /* # 14.9 Random and even walks
 
    The D directions of a walk are one point of a space of 2 D dimensions, and this space can be filled evenly (section
@@ -15990,6 +16040,8 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
     metro_chain_run(&batch->chain, 1);
     if (!(plan->options.large_step > 0) && round % 16 == 15) metro_chain_survey(&batch->chain, 1);
 }
+
+METROI_WARM
 
 /* # 14.11 The picture
 
@@ -16508,6 +16560,8 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
 #undef METROI_INLINE
 #endif /* METRO_NO_TRACER */
 
+#undef METROI_COLD
+#undef METROI_WARM
 #undef METROI_PI
 #undef METROI_NAN
 #undef METROI_INFINITY
