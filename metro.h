@@ -11539,7 +11539,7 @@ METROI_INLINE void metroi_ray_axes(metroi_ray *ray, metro_vec3 d, unsigned signs
         { 0, 8, 40, 24, 32, 16 }, { 24, 8, 40, 0, 32, 16 }, { 0, 32, 40, 24, 8, 16 }, { 24, 32, 40, 0, 8, 16 }
     };
     int y = fabs(d.y) > fabs(d.x), z = fabs(d.z) > metroi_larger(fabs(d.x), fabs(d.y));
-    int last = 2 * z + (y & (1 - z));
+    size_t last = (size_t)(2 * z + (y & (1 - z)));
     ray->row = row[signs];
     ray->axis[0] = next[last];
     ray->axis[1] = next[last + 1];
@@ -11560,8 +11560,8 @@ static int metroi_ray_enter(metro_vec3 *o, metro_vec3 d, double t_min, double *s
     return metro_dot(*o, *o) < 64;
 }
 
-/* Returns 0 for a ray that hits nothing. A NaN is in no range; two of three in the direction get by, and fail all
-   comparisons of 10.7. */
+/* Returns 0 for a ray that hits nothing. A NaN in the origin or in z of the direction is in no range; one in x or y
+   gets by, and fails every comparison of 10.7. */
 METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec3 d, double t_min, double t_max,
                                   metroi_ray *ray)
 {
@@ -11708,7 +11708,8 @@ METROI_INLINE int metroi_own_box(const metroi_block *block, int i, const metroi_
 /* Tests the four triangles of a block, and returns a bit for each that is hit between t_min and t. */
 METROI_INLINE unsigned metroi_block_plain(const metroi_block *block, const metroi_ray *ray, metroi_lanes *lanes)
 {
-    int kx = ray->axis[0], ky = ray->axis[1], kz = ray->axis[2], i, j;
+    size_t kx = ray->axis[0], ky = ray->axis[1], kz = ray->axis[2];
+    int i, j;
     unsigned mask = 0;
     for (i = 0; i < 4; i++) {
         float x[3], y[3], z[3], U, V, W, T, t, enter;
@@ -11783,8 +11784,16 @@ METROI_INLINE void metroi_ray4_axis(const metroi_ray *ray, int k, metroi_ray4 *s
     s->origin[k] = metroi_v4_all(ray->origin[k]);
     s->inverse[k] = metroi_v4_all(ray->inverse[k]);
     s->padded[k] = metroi_v4_all(ray->inverse[k] * METROI_PAD_NODE);
-    s->row[k] = ray->row[k];
-    s->row[k + 3] = ray->row[k + 3];
+}
+
+METROI_INLINE void metroi_rows_spread(const metroi_ray *ray, size_t row[6])
+{
+    row[0] = ray->row[0];
+    row[1] = ray->row[1];
+    row[2] = ray->row[2];
+    row[3] = ray->row[3];
+    row[4] = ray->row[4];
+    row[5] = ray->row[5];
 }
 
 METROI_INLINE metroi_v4 metroi_v4_plane(const float *row, metroi_v4 origin, metroi_v4 inverse)
@@ -11970,8 +11979,7 @@ METROI_AVX2 METROI_INLINE void metroi_ray8_make(const metroi_ray *ray, metroi_ra
     metroi_v8_spread(r, s->inverse);
     metroi_v8_spread(metroi_v4_sub(metroi_v4_sub(zero, shift), margin), s->enter);
     metroi_v8_spread(metroi_v4_sub(margin, shift), s->leave);
-    s->row[0] = ray->row[0], s->row[1] = ray->row[1], s->row[2] = ray->row[2];
-    s->row[3] = ray->row[3], s->row[4] = ray->row[4], s->row[5] = ray->row[5];
+    metroi_rows_spread(ray, s->row);
 }
 
 METROI_AVX2 METROI_INLINE metroi_v8 metroi_v8_plane(const float *row, metroi_v8 inverse, metroi_v8 shift)
@@ -12117,6 +12125,7 @@ static void metroi_walk_four(const metroi_bvh *bvh, metroi_ray *ray, int any)
     metroi_ray4_axis(ray, 0, &spread);
     metroi_ray4_axis(ray, 1, &spread);
     metroi_ray4_axis(ray, 2, &spread);
+    metroi_rows_spread(ray, spread.row);
     if (any) metroi_walk(bvh, ray, 1, metroi_boxes_four, metroi_block_four, &spread);
     else metroi_walk(bvh, ray, 0, metroi_boxes_four, metroi_block_four, &spread);
 }
