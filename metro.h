@@ -1637,10 +1637,23 @@ METRO_API void metro_bundles_free(metro_bundles *bundles);
 extern "C" {
 #endif
 
-/* A lesson is compiled more often than it is run for long. So gcc is held to -O1 between METROI_COLD and METROI_WARM,
-   where it would do more: `make bench` finds nothing slower. What is compiled without optimization stays so. */
+/* Compilers may join a product and a sum into one instruction that rounds once, and do so for some products and not
+   for others, as the processor has it; here they must not, so that a seed gives the same numbers everywhere.
 
-#if defined(__GNUC__) && !defined(__clang__) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
+   A lesson is compiled more often than it is run for long. So gcc leaves out four passes that take a tenth of the
+   time of compiling and make no picture faster, and is held to -O1 between METROI_COLD and METROI_WARM, where little
+   time is spent. What is compiled without optimization stays so. The rest has the same options throughout, for gcc
+   does not inline a function into one that has others. */
+
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT OFF
+#elif defined(__GNUC__)
+#define METROI_OPTIONS
+#pragma GCC push_options
+#pragma GCC optimize("fp-contract=off")
+#endif
+#if defined(METROI_OPTIONS) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
+#pragma GCC optimize("no-gcse,no-schedule-insns2,no-ivopts,no-tree-dominator-opts")
 #define METROI_COLD _Pragma("GCC push_options") _Pragma("GCC optimize(\"O1\")")
 #define METROI_WARM _Pragma("GCC pop_options")
 #else
@@ -2448,6 +2461,8 @@ METRO_API double metro_kernel_reflect_perturb(const metro_kernel *k, double x, m
     return metroi_fold(metroi_kernel_draw(k, x, rng));
 }
 
+METROI_COLD
+
 /* # 3.5 The spectrum of Kelemen's kernel
 
    The transform of a density 1/(2 L abs(u)) between s1 and s2 is a difference of cosine integrals,
@@ -2933,6 +2948,8 @@ METRO_API double metro_kernel_reflect_density(const metro_kernel *k, double from
     return metroi_circle_density(k, to - from, 2) + metroi_circle_density(k, to + from, 2); /* eq 3.15 */
 }
 
+METROI_WARM
+
 /* # 3.9 Directions
 
    A direction is turned by an angle theta from the old one, in a plane at a uniform azimuth. Near the axis 1 -
@@ -3378,6 +3395,8 @@ METRO_API void metro_chain_run(metro_chain *chain, uint64_t steps)
     metro_chain_flush(chain);
 }
 
+METROI_COLD
+
 /* # 4.5 Starting
 
    The seed decides what the first samples are, and the policies below are the ways to live with that. All of them end
@@ -3546,7 +3565,6 @@ METRO_API double metro_chain_b(const metro_chain *chain, double *error)
     return metro_moments_mean(&chain->normalisation);
 }
 
-METROI_COLD
 /* # 5 Start-up theory
 
    A Metropolis chain needs no knowledge of its target to start, and pays for that at the start: its first samples lie
@@ -11360,18 +11378,9 @@ METROI_WARM
 /* # 10.6 Rays and boxes
 
    The tests below must give the same bits wherever they are compiled, or a ray slips through where one triangle
-   rounds this way and its neighbour that way. Compilers may join a product and a sum into one instruction that rounds
-   once, and do so for some products and not for others; here they must not. */
+   rounds this way and its neighbour that way: every product is rounded, and so is every sum.
 
-#if defined(__clang__)
-#pragma STDC FP_CONTRACT OFF
-#elif defined(__GNUC__)
-#pragma GCC push_options
-#pragma GCC optimize("fp-contract=off")
-#define METROI_ROUND_EACH
-#endif
-
-/* Processors have instructions that do the same to four floats. A wrapper gives one name to those of SSE2, which
+   Processors have instructions that do the same to four floats. A wrapper gives one name to those of SSE2, which
    every 64-bit PC has, and of NEON, which every 64-bit ARM has; elsewhere, or with METRO_NO_SIMD defined, plain C
    does the work. Minimum and maximum keep the second number when one is NaN, and a mask has a bit for each sign. */
 
@@ -12114,8 +12123,7 @@ METROI_INLINE void metroi_walk(const metroi_bvh *bvh, metroi_ray *ray, int any, 
 
 static void metroi_walk_plain(const metroi_bvh *bvh, metroi_ray *ray, int any)
 {
-    if (any) metroi_walk(bvh, ray, 1, metroi_boxes_plain, metroi_block_plain, NULL);
-    else metroi_walk(bvh, ray, 0, metroi_boxes_plain, metroi_block_plain, NULL);
+    metroi_walk(bvh, ray, any, metroi_boxes_plain, metroi_block_plain, NULL);
 }
 
 #ifdef METROI_SIMD
@@ -12195,13 +12203,6 @@ METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, 
     metroi_walk_best(bvh, &ray, 1);
     return ray.triangle != METROI_NONE;
 }
-
-#ifdef METROI_ROUND_EACH
-#pragma GCC pop_options
-#undef METROI_ROUND_EACH
-#elif defined(__clang__)
-#pragma STDC FP_CONTRACT DEFAULT
-#endif
 
 /* # 10.10 Leaving a surface
 
@@ -14524,8 +14525,6 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
     metroi_report_warn(render, report);
 }
 
-METROI_WARM
-
 /* # 14 Ray bundles
 
    The methods so far follow one path at a time. Lines that cross the whole scene, each of which moves light between
@@ -14546,8 +14545,6 @@ METROI_WARM
 
    where $A(i, j, omega')$ is the projected area of patch $j$ that patch $i$ sees in direction omega'. It is the
    equation of the whole scene, not of a point, and each matrix A is one bundle. */
-
-METROI_COLD
 
 /* # 14.1 Patches
 
@@ -16569,6 +16566,12 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
 #undef METROI_INLINE
 #endif /* METRO_NO_TRACER */
 
+#if defined(__clang__)
+#pragma STDC FP_CONTRACT DEFAULT
+#elif defined(METROI_OPTIONS)
+#pragma GCC pop_options
+#undef METROI_OPTIONS
+#endif
 #undef METROI_COLD
 #undef METROI_WARM
 #undef METROI_PI
