@@ -1638,7 +1638,7 @@ extern "C" {
 #endif
 
 /* Compilers may join a product and a sum into one instruction that rounds once, and do so for some products and not
-   for others, as the processor has it; here they must not, so that a seed gives the same numbers everywhere.
+   for others, as the processor has it; here they must not, so that a seed gives the same numbers on all of them.
 
    A lesson is compiled more often than it is run for long. So gcc leaves out four passes that take a tenth of the
    time of compiling and make no picture faster, and is held to -O1 between METROI_COLD and METROI_WARM, where little
@@ -11579,7 +11579,7 @@ METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec
     unit = bvh->size;
     per_unit = bvh->scale;
     while (!(largest > 1e-15 && largest < 1e15)) { /* brings directions into the range of floats */
-        double boost = largest < 1 ? 1099511627776.0 : 1 / 1099511627776.0;
+        double boost = largest < 1 ? 1099511627776.0 : 1 / 1099511627776.0; /* 2^40: nothing is rounded */
         if (!(largest > 0 && largest < METROI_INFINITY)) return 0;
         d = metro_scale(d, boost);
         largest *= boost;
@@ -11803,6 +11803,14 @@ METROI_INLINE void metroi_rows_spread(const metroi_ray *ray, size_t row[6])
     row[3] = ray->row[3];
     row[4] = ray->row[4];
     row[5] = ray->row[5];
+}
+
+METROI_INLINE void metroi_ray4_make(const metroi_ray *ray, metroi_ray4 *s)
+{
+    metroi_ray4_axis(ray, 0, s);
+    metroi_ray4_axis(ray, 1, s);
+    metroi_ray4_axis(ray, 2, s);
+    metroi_rows_spread(ray, s->row);
 }
 
 METROI_INLINE metroi_v4 metroi_v4_plane(const float *row, metroi_v4 origin, metroi_v4 inverse)
@@ -12130,10 +12138,7 @@ static void metroi_walk_plain(const metroi_bvh *bvh, metroi_ray *ray, int any)
 static void metroi_walk_four(const metroi_bvh *bvh, metroi_ray *ray, int any)
 {
     metroi_ray4 spread;
-    metroi_ray4_axis(ray, 0, &spread);
-    metroi_ray4_axis(ray, 1, &spread);
-    metroi_ray4_axis(ray, 2, &spread);
-    metroi_rows_spread(ray, spread.row);
+    metroi_ray4_make(ray, &spread);
     if (any) metroi_walk(bvh, ray, 1, metroi_boxes_four, metroi_block_four, &spread);
     else metroi_walk(bvh, ray, 0, metroi_boxes_four, metroi_block_four, &spread);
 }
@@ -15460,11 +15465,6 @@ static void metroi_painter(metroi_bundle *bundle)
    their ends need not be rounded. So the same code is exact along the row, and only the rows are samples
    (Szirmay-Kalos, Foris and Purgathofer 1998c take the limit in both directions by an analytic visibility). */
 
-static void metroi_sweep_lines(metroi_bundle *bundle)
-{
-    metroi_sweep(bundle, 0);
-}
-
 static void metroi_bundle_free(metroi_bundle *bundle)
 {
     METRO_FREE(bundle->radiance);
@@ -15538,7 +15538,7 @@ static void metroi_bundle_move(metroi_bundle *bundle, metro_vec3 direction, cons
     case METRO_SWEEP: metroi_sweep(bundle, 1); break;
     case METRO_FRAGMENTS: metroi_fragments(bundle); break;
     case METRO_PAINTER: metroi_painter(bundle); break;
-    case METRO_LINES: metroi_sweep_lines(bundle); break;
+    case METRO_LINES: metroi_sweep(bundle, 0); break;
     }
 }
 

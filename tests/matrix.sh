@@ -106,6 +106,11 @@ if have gcc; then
         nm -g --defined-only $work/all.o | grep -vE ' (metro_[a-z0-9_]+|main)\$'
         nm $work/all.o | grep -E ' [bBdDC] '
         true"
+    later "the same picture without SIMD" "for way in METRO_NO_SIMD METRO_WITH_SIMD; do
+            gcc -std=gnu99 -O2 -D\$way -o $work/\$way examples/render.c -lm -lpthread
+            $work/\$way examples/scenes/hidden.obj --size 32x32 --rounds 16 --out $work/\$way.pfm > /dev/null 2>&1
+        done
+        cmp $work/METRO_NO_SIMD.pfm $work/METRO_WITH_SIMD.pfm"
     later "no private macro leaks" \
         "gcc -std=c99 -dM -E $work/all.c | grep 'define METROI_' | grep -vE 'METROI_(UNUSED|H)\b' || true"
 fi
