@@ -1641,7 +1641,7 @@ extern "C" {
    for others, as the processor has it; here they must not, so that a seed gives the same numbers on all of them.
 
    A lesson is compiled more often than it is run for long. So gcc leaves out four passes that take a tenth of the
-   time of compiling and make no picture faster, and is held to -O1 between METROI_COLD and METROI_WARM, where little
+   time of compiling and make no picture faster, and is held to -Og between METROI_COLD and METROI_WARM, where little
    time is spent. What is compiled without optimization stays so. The rest has the same options throughout, for gcc
    does not inline a function into one that has others. */
 
@@ -1654,7 +1654,7 @@ extern "C" {
 #endif
 #if defined(METROI_OPTIONS) && defined(__OPTIMIZE__) && !defined(__OPTIMIZE_SIZE__)
 #pragma GCC optimize("no-gcse,no-schedule-insns2,no-ivopts,no-tree-dominator-opts")
-#define METROI_COLD _Pragma("GCC push_options") _Pragma("GCC optimize(\"O1\")")
+#define METROI_COLD _Pragma("GCC push_options") _Pragma("GCC optimize(\"Og\")")
 #define METROI_WARM _Pragma("GCC pop_options")
 #else
 #define METROI_COLD
@@ -16047,8 +16047,6 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
     if (!(plan->options.large_step > 0) && round % 16 == 15) metro_chain_survey(&batch->chain, 1);
 }
 
-METROI_WARM
-
 /* # 14.11 The picture
 
    The last step is a final gathering: through each pixel go 6 x 6 rays, and each sees the radiance of the patch that
@@ -16561,6 +16559,8 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
     report->dark = dark / steps;
     report->squared_jump = jump / steps;
 }
+
+METROI_WARM
 
 #undef METROI_NO_PATCH
 #undef METROI_INLINE
