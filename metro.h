@@ -21,6 +21,7 @@
    - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
    - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
    - METRO_NO_TRACER: leaves out chapters 9 to 14, so that a lesson on the sampler compiles in a blink.
+   - METRO_NO_SIMD: rays are traced in plain C, for the same pictures in twice the time.
    - METRO_ASSERT(condition): what to do about a programmer's error, the start of a chain that was not made; `assert`
      otherwise.
 
@@ -1228,10 +1229,11 @@ typedef struct {
 } metro_hit;
 
 /* Makes the scene ready for the queries below, and finds the triangles that emit; to be called once, after the last
-   triangle. A triangle that is not finite keeps its number and is never hit; a scene without triangles is built like
-   any other; one that is built already is left as it is. Returns METRO_ERROR_ARGUMENT (a NULL, 2^30 triangles or
-   more) or METRO_ERROR_MEMORY, and then the scene is as it was. Cost: n log n for n triangles; about 100 bytes a
-   triangle while it works, of which about 55 stay. */
+   triangle. A triangle that is not finite keeps its number and is never hit, and one that is 1e22 times as small as
+   the largest coordinate of the scene need not be; a scene without triangles is built like any other; one that is
+   built already is left as it is. Returns METRO_ERROR_ARGUMENT (a NULL, 2^30 triangles or more, lamps whose power is
+   too large for a double) or METRO_ERROR_MEMORY, and then the scene is as it was. Cost: n log n for n triangles;
+   about 150 bytes a triangle while it works, of which about 60 stay. */
 METRO_API metro_result metro_scene_build(metro_scene *scene);
 
 /* Gives back all memory and leaves the empty scene; the empty scene and NULL are allowed. */
@@ -1241,10 +1243,11 @@ METRO_API void metro_scene_free(metro_scene *scene);
    alone. Both inequalities hold for the t that is written, as doubles; either bound may be infinite, and t_min
    negative. Of hits at the same t the triangle with the lowest number is taken. The direction may be as short as
    1e-300 or as long as 1e300; one of length 0, and a NaN or an infinity in origin or direction, hit nothing, and
-   neither does anything before the build. Inside, numbers are floats: t, u and v carry about seven digits of the
-   distance and of the triangle. No ray from the inside of a closed mesh gets out between its triangles. The answer
-   does not depend on the instructions that the processor has, where a float is a float (not on the x87). Cost: about
-   log n. Source: Woop, Benthin and Wald 2013. */
+   neither does anything before the build. Inside, numbers are floats: t carries about seven digits, and u and v are
+   off by about 1e-7 times the distance over the size of the triangle. Neither `scene` nor `hit` may be NULL. No ray
+   from the inside of a closed mesh gets out between its triangles. The answer does not depend on the instructions
+   that the processor has, where a float is a float (not on the x87). Cost: about log n. Source: Woop, Benthin and
+   Wald 2013. */
 METRO_API int metro_scene_hit(const metro_scene *scene, metro_vec3 origin, metro_vec3 direction, double t_min,
                               double t_max, metro_hit *hit);
 
@@ -1261,8 +1264,9 @@ METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, 
 METRO_API metro_vec3 metro_brdf(const metro_material *material, metro_vec3 normal, metro_vec3 in, metro_vec3 out);
 
 /* Draws `in` for a given `out` from the two numbers u and v of [0, 1), and returns its density per steradian (eq
-   11.2). A direction that falls below the surface is lost: the density is then 0. Cost: a square root, a sine, a
-   cosine and for the glossy part two powers. */
+   11.2). A direction that falls below the surface is lost: the density is then 0, and `in` is written all the same.
+   `normal` and `out` are unit vectors. Cost: two square roots, a sine, a cosine and for the glossy part two
+   powers. */
 METRO_API double metro_brdf_sample(const metro_material *material, metro_vec3 normal, metro_vec3 out, double u,
                                    double v, metro_vec3 *in);
 
@@ -10740,8 +10744,8 @@ METROI_WARM
 
    Light travels along rays, and the one question a ray asks is which triangle it meets first. Asking every triangle
    answers it, at a cost that grows with their number. A bounding volume hierarchy is a tree of boxes: each box holds
-   all the triangles below it, so a ray that misses the box need not look at any of them. Half a million triangles
-   then cost a ray about a dozen boxes.
+   all the triangles below it, so a ray that misses the box need not look at any of them. In half a million
+   triangles a ray then looks at some sixty boxes, eight at a time, and at a few triangles.
 
    The chapter has three parts. First the tree is built: where to cut a heap of triangles (10.2), how to make a wide
    tree of a narrow one (10.3), how it lies in memory (10.4). Then come the two tests that a ray makes, against boxes
@@ -10765,9 +10769,10 @@ METROI_WARM
    set, of a leaf. A leaf is one block or two, and a block four triangles, again number by number. Corners lie in the
    block itself: to follow an index to a vertex somewhere else would cost more than the test.
 
-   Floats are half as large as doubles and twice as many fit an instruction. So that none of their products leaves
-   their range, whatever unit the scene is in, coordinates are divided by a power of two that brings the largest into
-   [1/2, 1); dividing by it rounds nothing. */
+   Floats are half as large as doubles and twice as many fit an instruction. So that none of their products is too
+   large for them, whatever unit the scene is in, coordinates are divided by a power of two that brings the largest
+   into [1/2, 1); dividing by it rounds nothing. What is smaller than that by a factor of 1e22 is lost: the products
+   of eq 10.7 are 0 there. */
 
 typedef struct {
     float bound[48]; /* of the eight children in turn: lower x, lower y, lower z, then upper x, y, z */
@@ -10776,7 +10781,7 @@ typedef struct {
 } metroi_node;
 
 typedef struct {
-    float corner[3][3][4]; /* [corner][axis][triangle] */
+    float corner[36]; /* of corner j, axis k and triangle i: [12 j + 4 k + i] */
     uint32_t triangle[4];  /* their numbers */
 } metroi_block;
 
@@ -10800,6 +10805,16 @@ METROI_INLINE float metroi_low(float a, float b)
 METROI_INLINE float metroi_high(float a, float b)
 {
     return a > b ? a : b;
+}
+
+METROI_INLINE double metroi_larger(double a, double b)
+{
+    return a > b ? a : b;
+}
+
+METROI_INLINE double metroi_smaller(double a, double b)
+{
+    return a < b ? a : b;
 }
 
 /* While the tree is being built a triangle is no more than its box. Boxes have a fourth, idle number in each half, so
@@ -11040,12 +11055,14 @@ METROI_COLD
 
    The cuts make a binary tree, and its inner nodes are forks. A ray is better served by nodes with eight children,
    whose boxes are tested at once. So a node of the final tree stands for a fork and some of the forks below it, and
-   the question is which. Let C(n, i) be the least cost, times the area, of fork n when it appears as at most i
-   children of some node. As one child it is a leaf of at most two blocks, or a node with children of its own; as more
-   it shares them out between its two halves:
+   the question is which. Let C(n, i) be its area $A_n$ times the least cost to be expected below fork n when it
+   appears as at most i children of some node. As one child it is a leaf of at most two blocks, or a node with
+   children of its own; as more it shares them out between its two halves:
 
        C(n, 1) = min(A_n q_n, A_n + C(n, 8))                                             (10.3)
        C(n, i) = min(C(n, i - 1), min_{0 < k < i} (C(l, k) + C(r, i - k)))               (10.4)
+
+   with the blocks $q_n$ of fork n as a leaf, its halves l and r, and for i = 8 the inner minimum alone.
 
    Looking at a node and testing a block cost the same here, which is about true. Since a fork comes after its parent
    in the list, one pass from the end to the front computes all costs; `part` remembers the choices (Wald, Benthin and
@@ -11213,7 +11230,7 @@ static void metroi_block_set(const metroi_builder *b, metroi_block *block, int l
     int i;
     for (i = 0; i < 9; i++) {
         double x = triangle != METROI_NONE ? (double)corner[9 * (size_t)triangle + (size_t)i] : METROI_NAN;
-        block->corner[i / 3][i % 3][lane] = (float)(x * b->bvh->scale);
+        block->corner[4 * i + lane] = (float)(x * b->bvh->scale);
     }
     block->triangle[lane] = triangle;
 }
@@ -11290,15 +11307,15 @@ static void metroi_bvh_free(metroi_bvh *bvh)
     METRO_FREE(bvh);
 }
 
-/* The power of two above the largest finite coordinate. */
+/* The power of two above the largest coordinate of the finite triangles. */
 static double metroi_scene_size(const metro_scene *scene)
 {
     double largest = 0;
-    size_t i;
+    size_t i, k;
     int exponent = 0;
-    for (i = 0; i < 9 * scene->triangle_count; i++) {
-        double x = fabs((double)scene->corner[i]);
-        if (x > largest && x < METROI_INFINITY) largest = x;
+    for (i = 0; i < scene->triangle_count; i++) {
+        if (!metroi_triangle_is_finite(scene, (uint32_t)i)) continue;
+        for (k = 0; k < 9; k++) largest = metroi_larger(largest, fabs((double)scene->corner[9 * i + k]));
     }
     frexp(largest, &exponent);
     return ldexp(1.0, exponent);
@@ -11444,9 +11461,9 @@ METROI_INLINE metroi_v4 metroi_v4_from(metro_vec3 a)
 #endif
 
 /* A ray comes with an origin and a direction in any units. We divide the origin by the scene's size and the direction
-   by its own largest component, which makes that component 1 or -1 and t a length in units of the scene. Multiplied
-   by `unit` it is the caller's t again. The bounds that the caller gave are compared as doubles, with the caller's t;
-   inside, bounds that are a little too wide save time and decide nothing. */
+   by its own largest component, which makes that component 1 or -1 and t the way along its axis in units of the
+   scene. Multiplied by `unit` it is the caller's t again. The bounds that the caller gave are compared as doubles,
+   with the caller's t; inside, bounds that are a little too wide save time and decide nothing. */
 
 typedef struct {
     METROI_ALIGNED float origin[4]; /* here and below the fourth number is idle */
@@ -11470,21 +11487,6 @@ METROI_INLINE uint32_t metroi_float_bits(float x)
     return bits;
 }
 
-METROI_INLINE double metroi_larger(double a, double b)
-{
-    return a > b ? a : b;
-}
-
-METROI_INLINE double metroi_smaller(double a, double b)
-{
-    return a < b ? a : b;
-}
-
-METROI_INLINE double metroi_largest(metro_vec3 a)
-{
-    return metroi_larger(metroi_larger(fabs(a.x), fabs(a.y)), fabs(a.z));
-}
-
 /* A box is the common part of three slabs, each between two planes. The ray is inside the slab of axis k between the
    times at which it crosses the two planes, and inside the box when it is inside all three:
 
@@ -11501,16 +11503,18 @@ METROI_INLINE double metroi_largest(metro_vec3 a)
    Rounding may make the time of entrance too late and that of exit too early. A difference and a product round once
    each, by at most 6e-8, and the inverse three times, with the two floats that it is the quotient of. So if the later
    of the two is made longer by ten times that, no box is missed that the exact ray would hit (Ize 2013). For the box
-   of a single triangle 10.7 asks for more, 1e-6, and boxes of nodes get a little more again, for the reason that is
-   given there. */
+   of a single triangle 10.7 asks for twice as much, and boxes of nodes get a little more again, for the reason that
+   is given there. */
 
-#define METROI_PAD 1.000001f
-#define METROI_PAD_NODE 1.0000015f
+#define METROI_PAD 1.0000012f /* in floats 1 + 20 e, e = 2^-24 */
+#define METROI_PAD_NODE 1.0000015f /* 1 + 26 e */
 #define METROI_REACH 3e38f /* stands for infinity where that would become NaN */
 
-/* Makes floats of the ray, and returns a bit for each negative component. A walk begins with the inverse, so that is
-   a quotient of floats and does not wait for `unit`, the direction divided by its largest component. */
-METROI_INLINE unsigned metroi_ray_floats(metroi_ray *ray, metro_vec3 o, metro_vec3 d, double largest, metro_vec3 unit)
+/* Makes floats of the ray, and returns a bit for each negative component. The first box needs the inverse at
+   once, so that is a quotient of floats and does not wait for `along`, the direction divided by its largest
+   component. */
+METROI_INLINE unsigned metroi_ray_floats(metroi_ray *ray, metro_vec3 o, metro_vec3 d, double largest,
+                                         metro_vec3 along)
 {
 #ifdef METROI_SIMD
     metroi_v4 way = metroi_v4_from(d), inverse = metroi_v4_div(metroi_v4_all((float)largest), way);
@@ -11518,18 +11522,18 @@ METROI_INLINE unsigned metroi_ray_floats(metroi_ray *ray, metro_vec3 o, metro_ve
     metroi_v4 reach = metroi_v4_low(metroi_v4_high(inverse, least), most);
     metroi_v4 endless = metroi_v4_or(metroi_v4_le(reach, least), metroi_v4_le(most, reach));
     metroi_v4_store(ray->origin, metroi_v4_from(o));
-    metroi_v4_store(ray->direction, metroi_v4_from(unit));
+    metroi_v4_store(ray->direction, metroi_v4_from(along));
     metroi_v4_store(ray->inverse, inverse);
     metroi_v4_store(ray->reach, reach);
     metroi_v4_store(ray->spare, metroi_v4_and(endless, most));
     return metroi_v4_mask(way) & 7;
 #else
-    const double from[3] = { o.x, o.y, o.z }, way[3] = { d.x, d.y, d.z }, along[3] = { unit.x, unit.y, unit.z };
+    const double from[3] = { o.x, o.y, o.z }, way[3] = { d.x, d.y, d.z }, to[3] = { along.x, along.y, along.z };
     unsigned signs = 0, k;
     for (k = 0; k < 3; k++) {
         float inverse = (float)largest / (float)way[k];
         ray->origin[k] = (float)from[k];
-        ray->direction[k] = (float)along[k];
+        ray->direction[k] = (float)to[k];
         ray->inverse[k] = inverse;
         ray->reach[k] = metroi_low(metroi_high(inverse, -METROI_REACH), METROI_REACH);
         ray->spare[k] = ray->reach[k] <= -METROI_REACH || METROI_REACH <= ray->reach[k] ? METROI_REACH : 0;
@@ -11558,9 +11562,9 @@ METROI_INLINE void metroi_ray_axes(metroi_ray *ray, metro_vec3 d, unsigned signs
     ray->shear[1] = ray->direction[ray->axis[1]] * ray->side;
 }
 
-/* A ray that begins far away, or before t = 0, is moved along itself to a distance of about 2 from the middle of the
-   scene, which lies within sqrt(3) of it: floats would not tell far points apart. Returns 0 for one that passes
-   by. */
+/* A ray that begins far away, or before t = 0, is moved along itself to a distance of 2 to 4 from the middle of the
+   scene, which lies within sqrt(3) of it, or to t_min if that is later: floats would not tell far points apart.
+   Returns 0 for one that passes by. */
 static int metroi_ray_enter(metro_vec3 *o, metro_vec3 d, double t_min, double *start)
 {
     double entrance = -metro_dot(*o, d) / metro_dot(d, d) - 2;
@@ -11574,7 +11578,7 @@ static int metroi_ray_enter(metro_vec3 *o, metro_vec3 d, double t_min, double *s
 METROI_INLINE int metroi_ray_make(const metroi_bvh *bvh, metro_vec3 o, metro_vec3 d, double t_min, double t_max,
                                   metroi_ray *ray)
 {
-    double largest = metroi_largest(d), inverse, unit, per_unit, low, high;
+    double largest = metroi_largest_component(d), inverse, unit, per_unit, low, high;
     if (bvh == NULL || bvh->block_count == 0 || !(t_min < t_max)) return 0;
     unit = bvh->size;
     per_unit = bvh->scale;
@@ -11653,7 +11657,7 @@ METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_
    two never both say "outside", and a 0, which counts as inside, is said by both. Here the products must be rounded
    before they are subtracted; a fused instruction rounds one of them and not the other.
 
-   Three zeros at once come from a triangle seen edge-on, or from no area at all; then t is infinite or NaN and fails
+   Three zeros at once come from a triangle seen edge-on, or from no area at all; then t is 0/0, a NaN, and fails
    the comparisons.
 
    The order in which triangles are tested must not matter, or four boxes at once would give other pictures than
@@ -11663,22 +11667,23 @@ METROI_INLINE unsigned metroi_boxes_plain(const metroi_node *node, const metroi_
 
        t <- max(t, t_near)                                                              (10.9)
 
-   which also gives a floor that is a thousand times as large as what stands on it the height that it has. But the box
-   must not refuse what eq 10.7 accepts, or the ray is lost to both neighbours. Rounding displaces a corner of eq 10.6
-   along x by at most 6e-8 of p_x - o_x and, with the rounding of s_x, twice that of s_x z_p. With the point h where
-   the ray hits, and L the extent of the triangle, both are below h_x - o_x plus L, since s_x z_h is h_x - o_x; so,
-   with the difference, the corner is off by 2.4e-7 of t, in time, and by 2.4e-7 of L, in length. Rounding the
-   products of eq 10.7 moves an edge by a few 1e-7 of L. The part in t, and the rounding of both times of eq 10.5, are
-   within the pad. The part in L is not: it counts where a ray begins close to the edge of a large triangle, whose far
-   corners are rounded though the hit is near. So the box has a margin when it is asked whether the ray meets it; L is
-   at most twice the largest coordinate. It has none when it is asked for t_near, or whether all of it is behind the
-   ray, for those need no more than a sign and a maximum.
+   which also helps large flat triangles: the box of a floor is as thin as the floor. But the box must not refuse what
+   eq 10.7 accepts, or the ray is lost to both neighbours. With e = 2^-24, rounding displaces a corner of eq 10.6
+   along x by e of p_x - o_x, three times that of s_x z_p (s_x, z_p and the product are rounded), and e of the
+   difference x_p. With the point h where the ray hits, and L the extent of the triangle, the first two lengths are
+   below h_x - o_x plus L, since s_x z_h is h_x - o_x, and the third is below 2 L: so the corner is off by 4 e of t,
+   in time, and by 6 e of L, in length. Rounding the products of eq 10.7 moves an edge by a few e of L. The part in t,
+   once where the ray enters and once where it leaves, and ten roundings of eq 10.5 come to 18 e and are within the
+   pad. The part in L is not: it counts where a ray begins close to the edge of a large triangle, whose far corners
+   are rounded though the hit is near. So the box has a margin when it is asked whether the ray meets it; L is at most
+   twice the largest coordinate. It has none when it is asked for t_near, or whether all of it is behind the ray, for
+   those need no more than a sign and a maximum.
 
    A box around this box and its margin has its planes farther out, and rounding is monotonic, so its t_near is not
-   larger, and its t_far not smaller: hence its larger pad, for which the corner is multiplied by a rounded product
-   instead of being padded last. A box on the way to an accepted triangle is therefore never left out, whatever else
-   was found, and the nearest hit, of equal ones that of the lowest number, is the same for every tree and every
-   order. The tests compare it, bit by bit, with a loop over all triangles.
+   larger, and its t_far not smaller: hence its larger pad, since there the distance of the plane is multiplied by a
+   1/d that is padded and rounded already, which may cost two roundings more. A box on the way to an accepted triangle
+   is therefore never left out, whatever else was found, and the nearest hit, of equal ones that of the lowest number,
+   is the same for every tree and every order. The tests compare it, bit by bit, with a loop over all triangles.
 
    For a component of d that is 0 a comparison with the triangle's own slab says no more than eq 10.7 does exactly,
    and `spare` makes it pass. */
@@ -11695,7 +11700,8 @@ METROI_INLINE int metroi_own_box(const metroi_block *block, int i, const metroi_
     int k;
     *enter = ray->t_min;
     for (k = 0; k < 3; k++) {
-        float a = block->corner[0][k][i], b = block->corner[1][k][i], c = block->corner[2][k][i];
+        const float *p = block->corner + 4 * k + i;
+        float a = p[0], b = p[12], c = p[24];
         lo[k] = metroi_low(metroi_low(a, b), c);
         hi[k] = metroi_high(metroi_high(a, b), c);
         a = (lo[k] - ray->origin[k]) * ray->reach[k];
@@ -11723,9 +11729,10 @@ METROI_INLINE unsigned metroi_block_plain(const metroi_block *block, const metro
     for (i = 0; i < 4; i++) {
         float x[3], y[3], z[3], U, V, W, T, t, enter;
         for (j = 0; j < 3; j++) { /* eq 10.6 */
-            z[j] = block->corner[j][kz][i] - ray->origin[kz];
-            x[j] = (block->corner[j][kx][i] - ray->origin[kx]) - ray->shear[0] * z[j];
-            y[j] = (block->corner[j][ky][i] - ray->origin[ky]) - ray->shear[1] * z[j];
+            const float *p = block->corner + 12 * j + i;
+            z[j] = p[4 * kz] - ray->origin[kz];
+            x[j] = (p[4 * kx] - ray->origin[kx]) - ray->shear[0] * z[j];
+            y[j] = (p[4 * ky] - ray->origin[ky]) - ray->shear[1] * z[j];
         }
         U = x[2] * y[1] - y[2] * x[1]; /* eq 10.7 */
         V = x[0] * y[2] - y[0] * x[2];
@@ -11891,7 +11898,7 @@ METROI_INLINE metroi_v4 metroi_v4_own_box(const float *row, const metroi_ray *ra
 METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi_ray *ray, metroi_lanes *lanes)
 {
     const size_t *axis = ray->axis;
-    const float *row = block->corner[0][0], *px = row + 4 * axis[0], *py = row + 4 * axis[1], *pz = row + 4 * axis[2];
+    const float *row = block->corner, *px = row + 4 * axis[0], *py = row + 4 * axis[1], *pz = row + 4 * axis[2];
     metroi_v4 ox = metroi_v4_all(ray->origin[axis[0]]), sx = metroi_v4_all(ray->shear[0]);
     metroi_v4 oy = metroi_v4_all(ray->origin[axis[1]]), sy = metroi_v4_all(ray->shear[1]);
     metroi_v4 oz = metroi_v4_all(ray->origin[axis[2]]);
@@ -11923,13 +11930,13 @@ METROI_INLINE unsigned metroi_block_four(const metroi_block *block, const metroi
 }
 #endif
 
-/* With AVX2 the eight boxes of a node are one instruction at a time, which saves a tenth of the time. The program
-   asks the processor when it runs, so nothing is asked of the compiler's options: the attribute permits the
+/* With AVX2 each step of the test is one instruction for all eight boxes, which saves a tenth of the time. The
+   program asks the processor when it runs, so nothing is asked of the compiler's options: the attribute permits the
    instructions in one function. gcc knows them by names of its own, and so does without the header of their common
    names, which would take a tenth as long to compile as all of this one.
 
-   A box need not be tested in the order of 10.6: it only must not be missed where 10.7 would accept a triangle in it.
-   So here the product and the difference of eq 10.5 are one fused instruction,
+   A box need not be tested in the form of eq 10.5: it only must not be missed where 10.7 would accept a triangle in
+   it. So here the product and the difference of eq 10.5 are one fused instruction,
 
        t_near = max_k (n_k r_k - (o_k r_k + m_k)),    t_far = min_k (f_k r_k - (o_k r_k - m_k))             (10.10)
 
@@ -12125,7 +12132,7 @@ METROI_INLINE void metroi_walk(const metroi_bvh *bvh, metroi_ray *ray, int any, 
             if (top == 0) return;
             top--;
         } while (!any && stack[top] >> 32 > metroi_float_bits(ray->t));
-        at = (uint32_t)(stack[top] & METROI_NONE);
+        at = (uint32_t)stack[top];
     }
 }
 
@@ -12216,23 +12223,26 @@ METRO_API int metro_scene_occluded(const metro_scene *scene, metro_vec3 origin, 
    rounded instead. Let e = 2^-24, what a float rounds off, and let a ray start at o near a triangle, all of whose
    corners lie within L of o along each axis. In eq 10.6 a corner is rounded three times and in the sum of eq 10.8
    four times, each time by at most e L; so the test sees the triangle's plane displaced by at most about 8 e L along
-   each axis, 14 e L at an angle. The weights U, V and W are rounded by up to 2 e L^2, each on its own. That is
+   each axis, 14 e L at an angle. The weights U, V and W are rounded by a few e L^2, each on its own. That is
    nothing beside their sum when the triangle is as wide as it is long; but of a needle, whose width w is its doubled
-   area over L, the sum is L w at most, and the hit moves by 2 e L/w of the length L. Starting higher than both above
-   the plane, and going away from it, the ray does not meet it. How flat it leaves does not matter, since a height is
-   compared with a height.
+   area over L, the sum is only L w, and the hit moves by a few e L/w of the length L. Starting higher than both above
+   the plane, and going away from it, the ray does not meet it. How flat it leaves does not matter: the sum and the
+   height over the length of the ray shrink alike.
 
    A ray rounds its start to floats (10.6), which moves it by up to $e abs(p_k)$ along axis k, and towards the plane
    by the share $abs(n_k)$ of that. So the height is
 
        h = 16 e L + min(w, 4 e L frac{L}{w}) + 2 e sum_k abs(n_k p_k)                    (10.11)
 
-   on the side of the triangle that the direction points to; a needle is not left by more than its width. A floor at y
-   = 0 of triangles 10 long gives a height of about 1e-5, and a contact shadow begins that near to the contact; far
-   from the origin of coordinates it is the spacing of the floats that decides, as it must.
+   on the side of the triangle that the direction points to. A needle is not left by more than its width; one that is
+   thousands of times as long as wide may therefore be met again. A floor at y = 0 of triangles 10 long gives a height
+   of about 1e-5, and a contact shadow begins that near to the contact; far from the origin of coordinates it is the
+   spacing of the floats that decides, as it must.
 
    In a corner of a room that rounding may carry the start sideways through the other wall. So the point first moves a
-   little towards the middle of its triangle, by as much as its coordinates may be rounded. */
+   little towards the middle of its triangle, by a few times what its coordinates may be rounded. That keeps it inside
+   where the triangles are about as wide as long. With walls of slender ones, some rays that start within rounding of
+   an edge still get out: to be safe from that, all points would have to move hundreds of times as far. */
 
 METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec3 point, metro_vec3 direction)
 {
@@ -12241,9 +12251,9 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
     metro_vec3 n = facet->normal, inward;
     double extent, per_extent, needle, height, shrink;
     if (!(facet->area2 > 0)) return point; /* no area, no side */
-    extent = metroi_largest(metro_subtract(p[0], point));
-    extent = metroi_larger(extent, metroi_largest(metro_subtract(p[1], point)));
-    extent = metroi_larger(extent, metroi_largest(metro_subtract(p[2], point)));
+    extent = metroi_largest_component(metro_subtract(p[0], point));
+    extent = metroi_larger(extent, metroi_largest_component(metro_subtract(p[1], point)));
+    extent = metroi_larger(extent, metroi_largest_component(metro_subtract(p[2], point)));
     per_extent = 1 / extent;
     needle = 4 * e * extent * (extent * extent * facet->per_area2); /* w is area2/L */
     needle = metroi_smaller(needle, facet->area2 * per_extent);
@@ -12251,7 +12261,7 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
     height += 2 * e * (fabs(n.x * point.x) + fabs(n.y * point.y) + fabs(n.z * point.z));
     if (metro_dot(n, direction) < 0) height = -height;
     inward = metro_subtract(metro_scale(metro_add(metro_add(p[0], p[1]), p[2]), 1.0 / 3), point);
-    shrink = metroi_smaller(4 * e * (1 + metroi_largest(point) * per_extent), 0.5);
+    shrink = metroi_smaller(4 * e * (1 + metroi_largest_component(point) * per_extent), 0.5);
     point = metro_add(point, metro_scale(inward, shrink));
     return metro_add(point, metro_scale(n, height));
 }
@@ -12278,26 +12288,27 @@ METROI_INLINE metro_vec3 metroi_facet_leave(const metroi_facet *facet, metro_vec
 
    The BRDF is the sum of a diffuse and a glossy lobe (Phong's, normalised by Lafortune and Willems 1994):
 
-       f(i, o) = frac{k_d}{pi} + k_s frac{n + 2}{2 pi} max(0, cos(a))^n               (11.1)
+       f(i, o) = frac{k_d}{pi} + k_s frac{m + 2}{2 pi} max(0, cos(a))^m               (11.1)
 
-   where a is the angle between i and the mirror image of o about the normal. It is symmetric, and with k_d + k_s <= 1
-   it sends out no more than it receives: the factor n + 2, rather than n + 1, makes the glossy lobe reflect k_s when
-   the light falls on it perpendicularly, and less at grazing angles, where a part of the lobe is below the surface.
+   where a is the angle between i and the mirror image of o about the normal, and m the exponent `Ns`. It is
+   symmetric, and with k_d + k_s <= 1 it sends out no more than it receives: the factor m + 2, rather than m + 1,
+   makes the glossy lobe reflect k_s when the light falls on it perpendicularly, and less at grazing angles, where a
+   part of the lobe is below the surface.
 
    A direction is drawn from the diffuse lobe with probability q, the share of k_d in k_d + k_s, and from the glossy
    lobe otherwise. Together the density per steradian is
 
-       p(i) = q frac{cos(theta_i)}{pi} + (1 - q) frac{n + 1}{2 pi} max(0, cos(a))^n            (11.2)
+       p(i) = q frac{cos(theta_i)}{pi} + (1 - q) frac{m + 1}{2 pi} max(0, cos(a))^m            (11.2)
 
    What eqs 11.1 and 11.2 share is computed once a material. */
 
 typedef struct {
     metro_vec3 diffuse;      /* k_d / pi */
-    metro_vec3 glossy;       /* k_s (n + 2)/(2 pi) */
+    metro_vec3 glossy;       /* k_s (m + 2)/(2 pi) */
     metro_vec3 emission;
-    double exponent;         /* n */
+    double exponent;         /* m */
     double share;            /* q; 1 where nothing is glossy */
-    double lobe;             /* (n + 1)/(2 pi) */
+    double lobe;             /* (m + 1)/(2 pi) */
     int black;               /* reflects nothing */
 } metroi_surface;
 
@@ -12360,7 +12371,7 @@ static inline metro_vec3 metroi_direction_at(metro_vec3 axis, double z, double t
 
 /* A uniform point of a disc lifted onto the hemisphere has the density cos/pi (Malley 1988): its height is the root
    of a uniform number. The glossy lobe is a power of the cosine about the mirror direction, so its height is a root
-   of order n + 1. One number serves twice: it chooses the lobe, and what is left of it is uniform again. */
+   of order m + 1. One number serves twice: it chooses the lobe, and what is left of it is uniform again. */
 
 static inline metro_vec3 metroi_surface_draw(const metroi_surface *surface, metro_vec3 normal, metro_vec3 out,
                                              double u, double v)
@@ -12439,14 +12450,14 @@ METROI_INLINE metro_vec3 metroi_light_point(const metroi_facet *lamp, double u, 
 
        d = f + tan("fov"/2) ((frac{2 x}{W} - 1) frac{W}{H} r - (frac{2 y}{H} - 1) u)              (11.4)
 
-   A pixel is the mean over its square. Let x and y be drawn uniformly over the whole film, of area $A = 4 tan^2
-   frac{W}{H}$. An area element of the film at the angle theta from f covers the solid angle cos^3(theta) of it, so
-   the density of the direction per steradian is
+   A pixel is the mean over its square. Let x and y be drawn uniformly over the whole film, of area
+   $A = 4 tan^2("fov"/2) frac{W}{H}$. An area element of the film at the angle theta from f covers the solid angle
+   cos^3(theta) of it, so the density of the direction per steradian is
 
        p(omega) = frac{1}{A cos^3(theta)}                                             (11.5)
 
-   and this is also how strongly the camera responds to light from there: what arrives from omega with that density
-   counts fully. */
+   and this is also how strongly the camera responds to light from there: a direction that is drawn with that density
+   has the weight 1. */
 
 typedef struct {
     metro_vec3 eye, forward, right, down; /* right and down reach from the middle of the film to its edges */
@@ -12466,7 +12477,7 @@ METRO_API metro_result metro_camera_check(const metro_camera *camera)
 static metroi_camera metroi_camera_make(const metro_camera *camera, size_t width, size_t height)
 {
     metroi_camera c;
-    double t = camera->fov > 0 && camera->fov < 180 ? tan(camera->fov * METROI_PI / 360) : METROI_NAN;
+    double t = metro_camera_check(camera) == METRO_OK ? tan(camera->fov * METROI_PI / 360) : METROI_NAN;
     double aspect = (double)width / (double)height;
     c.eye = camera->eye;
     c.forward = metro_normalize(metro_subtract(camera->look, camera->eye));
@@ -13808,23 +13819,33 @@ METROI_WARM
    Each chain is a job (section 1.3), and goes on where its last job ended. A round makes on average one mutation a
    pixel; it is cut into groups, so that a log stays small. */
 
-static metro_result metroi_walker_start_point(metroi_walker *walker, uint64_t index)
+/* A start from one point takes the first state, drawn with random numbers of its own, that is not dark. */
+
+static metro_result metroi_start_point(metro_chain *chain, double *z, uint64_t seed, uint64_t index,
+                                       size_t candidates)
 {
-    const metroi_metropolis *plan = walker->plan;
-    metro_rng rng = metro_rng_make(plan->options->start_seed, index);
-    double *z = (double *)METRO_MALLOC(metroi_state_doubles(&walker->chain.target) * sizeof *z);
+    metro_rng rng = metro_rng_make(seed, index);
     metro_result result = METRO_ERROR_DARK_SEED;
     size_t tries;
+    for (tries = 0; result == METRO_ERROR_DARK_SEED && tries < 64 * candidates; tries++) {
+        metroi_state_draw(&chain->target, z, &rng);
+        result = metro_chain_start_point(chain, z);
+    }
+    return result == METRO_ERROR_DARK_SEED ? METRO_ERROR_NO_IMPORTANCE : result;
+}
+
+static metro_result metroi_walker_start_point(metroi_walker *walker, uint64_t index)
+{
+    const metro_render_options *options = walker->plan->options;
+    double *z = (double *)METRO_MALLOC(metroi_state_doubles(&walker->chain.target) * sizeof *z);
+    metro_result result;
     if (z == NULL) return METRO_ERROR_MEMORY;
     walker->independent = 1;
-    metro_chain_survey(&walker->chain, plan->options->candidates);
+    metro_chain_survey(&walker->chain, options->candidates);
     walker->independent = 0;
-    for (tries = 0; result == METRO_ERROR_DARK_SEED && tries < 64 * plan->options->candidates; tries++) {
-        metroi_state_draw(&walker->chain.target, z, &rng);
-        result = metro_chain_start_point(&walker->chain, z);
-    }
+    result = metroi_start_point(&walker->chain, z, options->start_seed, index, options->candidates);
     METRO_FREE(z);
-    return result == METRO_ERROR_DARK_SEED ? METRO_ERROR_NO_IMPORTANCE : result;
+    return result;
 }
 
 /* A start from seeds takes up to 64 times as many candidates before it gives up. One from weighted seeds may not: the
@@ -16006,20 +16027,6 @@ static metro_result metroi_walk_chain(metroi_batch *batch, uint64_t index)
 
 /* Starts as in section 13.4. */
 
-static metro_result metroi_walk_start_point(metroi_batch *batch, uint64_t index)
-{
-    const metro_bundles_options *options = &batch->plan->options;
-    metro_rng rng = metro_rng_make(options->start_seed, index);
-    metro_result result = METRO_ERROR_DARK_SEED;
-    size_t tries;
-    metro_chain_survey(&batch->chain, options->candidates);
-    for (tries = 0; result == METRO_ERROR_DARK_SEED && tries < 64 * options->candidates; tries++) {
-        metroi_state_draw(&batch->chain.target, batch->state, &rng);
-        result = metro_chain_start_point(&batch->chain, batch->state);
-    }
-    return result == METRO_ERROR_DARK_SEED ? METRO_ERROR_NO_IMPORTANCE : result;
-}
-
 static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
 {
     metroi_bundles *plan = (metroi_bundles *)user;
@@ -16028,10 +16035,13 @@ static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
     int tries = options->start == METRO_START_WEIGHTED ? 1 : 64;
     metro_result result = METRO_ERROR_NO_IMPORTANCE;
     (void)slot;
-    if (options->start == METRO_START_POINT) result = metroi_walk_start_point(batch, job);
-    else
+    if (options->start == METRO_START_POINT) {
+        metro_chain_survey(&batch->chain, options->candidates);
+        result = metroi_start_point(&batch->chain, batch->state, options->start_seed, job, options->candidates);
+    } else {
         while (result == METRO_ERROR_NO_IMPORTANCE && tries-- > 0)
             result = metro_chain_start_weighted(&batch->chain, options->candidates);
+    }
     batch->alive = result == METRO_OK;
     batch->scale = options->start == METRO_START_WEIGHTED ? batch->chain.start_weight : 1;
     return result == METRO_ERROR_NO_IMPORTANCE ? METRO_OK : result;
@@ -16634,7 +16644,7 @@ METROI_WARM
    | R(k), rho_k | the correlation at lag k | `metro_autocorrelation` |
    | L, L_e | radiance, and what a lamp emits | `metro_material.ke`, `metroi_vertex.weight` times what follows |
    | omega | a direction, per steradian | `direction`, `in`, `out` |
-   | f_r, k_d, k_s, n | the BRDF and its numbers, eq 11.1 | `metro_brdf`; `kd`, `ks`, `ns` of `metro_material` |
+   | f_r, k_d, k_s, m | the BRDF and its numbers, eq 11.1 | `metro_brdf`; `kd`, `ks`, `ns` of `metro_material` |
    | theta | the angle between a direction and the normal | its cosine: `cosine`, `cos_y`, `cos_z` |
    | y_0 .. y_{s-1} | the vertices of the shooting walk, from the lamp | `metroi_walks.y` |
    | z_0 .. z_{t-1} | the vertices of the gathering walk, from the eye | `metroi_walks.z` |

@@ -544,8 +544,8 @@ static void bad_neighbours(void)
         add(&scene, p, p, p);                                 /* a point */
         add(&scene, p, q, p);                                 /* a line, twice covered */
         add(&scene, p, metro_scale(metro_add(p, q), 0.5), q); /* three points in a line */
-        add(&scene, vec(NAN, 0, 0), p, q);
-        add(&scene, p, vec(0, INFINITY, 0), q);
+        add(&scene, vec(NAN, 3e38, 0), p, q);
+        add(&scene, p, vec(0, INFINITY, 3e38), q);
         add(&scene, p, q, vec(0, 0, -INFINITY));
         add(&scene, metro_scale(p, 1e-8), metro_scale(q, 1e-8), vec(1e-8, 0, 0));
     }

@@ -248,7 +248,7 @@ static void draw_against_density(int i, double polar, int about_mirror, uint64_t
     }
     cell_masses(&m, normal, out, &f, power, p);
     snprintf(what, sizeof what, "material %d out at %g, %s", i, polar, about_mirror ? "about the mirror" : "about n");
-    chi_square(what, count, p, CELLS + 1, (double)samples);
+    check_chi_square(what, count, p, CELLS + 1, (double)samples);
     /* the mean of f cos / p over the draws is the albedo */
     hemisphere(&m, normal, out, &sum, &mass);
     CHECK_CLOSE(metro_moments_mean(&red), sum.x, 5.1 * metro_moments_error(&red) + 3e-4);
@@ -402,7 +402,7 @@ static void lamp_choice(void)
         if (cell >= 0 && cell < PIECES) count[lamp * PIECES + (size_t)cell]++;
     }
     for (i = 0; i < 6 * PIECES; i++) p[i] = power[i / PIECES] / total / PIECES;
-    chi_square("lamps and their points", count, p, 6 * PIECES, (double)samples);
+    check_chi_square("lamps and their points", count, p, 6 * PIECES, (double)samples);
     for (i = 0; i < 6; i++) {
         metroi_surface surface = metroi_surface_make(metro_scene_material(&scene, scene.material_of[i]));
         double area = metro_scene_area(&scene, (uint32_t)i);
@@ -566,6 +566,15 @@ static void camera_refusals(void)
         CHECK(metro_camera_check(&bad[i]) == METRO_ERROR_ARGUMENT, "camera %d is taken", i);
         d = metro_camera_direction(&bad[i], 128, 128, 30, 30);
         CHECK(isnan(d.x) && isnan(d.y) && isnan(d.z), "camera %d has the direction %g %g %g", i, d.x, d.y, d.z);
+    }
+    for (i = 0; i < 100; i++) { /* `up` along the view, but for rounding */
+        metro_camera along = good;
+        metro_vec3 d;
+        along.look = metro_vec3_make(0.01 * i, 0.3, 0.7);
+        along.up = metro_scale(metro_subtract(along.look, along.eye), 3);
+        CHECK(metro_camera_check(&along) == METRO_ERROR_ARGUMENT, "view %d is taken", i);
+        d = metro_camera_direction(&along, 128, 128, 30, 30);
+        CHECK(isnan(d.x), "view %d has the direction %g %g %g", i, d.x, d.y, d.z);
     }
     good.up = metro_vec3_make(1e-200, 1e-200, 1e-200);
     CHECK(metro_camera_check(&good) == METRO_OK, "a short up is refused");
