@@ -714,16 +714,16 @@ static void large_avoids_bias(const table *const *t, finding *f)
              a_error, b, b_error);
 }
 
-/* ln of the efficiency 1/(relMSE x seconds) at the last look. Of the repeats the table knows the extremes. They are
-   6, whose range is 6.2 times the standard error of their mean if they are normal, or 3 with QUICK=1, where it is 2.9
-   times; a fifth and a third leave room for those that are not. */
+/* ln of the efficiency 1/(relMSE x seconds) at the last look. Of the repeats the table knows the extremes. The range
+   of 6 is 6.2 times the standard error of their mean if they are normal, that of 3 is 2.9 times; a fifth and a third
+   leave room for those that are not. */
 static double efficiency(const table *t, const char *scene, const char *curve, double *error)
 {
     char query[120];
     size_t row;
     snprintf(query, sizeof query, "chart=error&scene=%s&curve=%s", scene, curve);
     row = row_last(t, query);
-    *error = log(number(t, row, "high") / number(t, row, "low")) / (plot_quick() ? 3 : 5);
+    *error = log(number(t, row, "high") / number(t, row, "low")) / (number(t, row, "repeats") < 6 ? 3 : 5);
     return -log(number(t, row, "value") * number(t, row, "x"));
 }
 

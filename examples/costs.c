@@ -19,8 +19,8 @@
    of triangles, and with depth only as far as paths go.
 
    Writes out/costs.svg, out/costs_scale.svg and out/costs.csv: for the chart `error`, x is the computing time in
-   seconds, value relMSE (mean over the repeats) and low and high their extremes, rmse the relative RMSE; for the
-   others x is what the chart is named after, value the time of a sample in microseconds. */
+   seconds, value relMSE (mean over the repeats) and low and high their extremes, rmse the relative RMSE, repeats their
+   number; for the others x is what the chart is named after, value the time of a sample in microseconds. */
 
 #define _POSIX_C_SOURCE 200809L
 #define METRO_IMPLEMENTATION
@@ -333,7 +333,7 @@ static void write_curve(plot_csv *csv, const setting *s, const char *name, const
         plot_csv_text(csv, "error");
         plot_csv_text(csv, s->name);
         plot_csv_text(csv, name);
-        PLOT_CSV_ROW(csv, c->seconds[k], c->value[k], c->low[k], c->high[k], c->rmse[k]);
+        PLOT_CSV_ROW(csv, c->seconds[k], c->value[k], c->low[k], c->high[k], c->rmse[k], (double)repeats_of_all());
     }
 }
 
@@ -471,7 +471,7 @@ static void write_cost(plot_csv *csv, const char *chart, const char *name, doubl
     plot_csv_text(csv, chart);
     plot_csv_text(csv, "Cornell box");
     plot_csv_text(csv, name);
-    PLOT_CSV_ROW(csv, x, value, (double)NAN, (double)NAN, (double)NAN);
+    PLOT_CSV_ROW(csv, x, value, (double)NAN, (double)NAN, (double)NAN, (double)NAN);
 }
 
 static int chart_triangles(const metro_scene *scene, plot_panel *cost, plot_panel *build, plot_csv *csv,
@@ -669,7 +669,7 @@ int main(void)
     static setting s[SCENES];
     static curve curves[SCENES][CURVES];
     static pilots p[SCENES];
-    plot_csv csv = plot_csv_open("out/costs.csv", "chart,scene,curve,x,value,low,high,rmse");
+    plot_csv csv = plot_csv_open("out/costs.csv", "chart,scene,curve,x,value,low,high,rmse,repeats");
     plot_chart chart = error_sheet(), costs = cost_sheet();
     char title[300], note[200], cost_title[200];
     double growth = 0, speedup = 0;

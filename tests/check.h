@@ -92,6 +92,32 @@ static inline double check_chi_square_bound(double freedom)
     return freedom * c * c * c;
 }
 
+/* Chi square of `count[i]` against samples * p[i]; cells that expect fewer than 10 are put together. */
+static inline void check_chi_square(const char *what, const double *count, const double *p, int cells, double samples)
+{
+    double sum = 0, rest_count = 0, rest = 0, freedom = -1;
+    int i;
+    for (i = 0; i < cells; i++) {
+        double expected = samples * p[i];
+        if (expected < 10) {
+            rest_count += count[i];
+            rest += expected;
+            continue;
+        }
+        sum += (count[i] - expected) * (count[i] - expected) / expected;
+        freedom++;
+    }
+    if (rest > 2) {
+        sum += (rest_count - rest) * (rest_count - rest) / rest;
+        freedom++;
+    } else {
+        CHECK(rest_count <= 25, "%s: %g draws in cells that expect %g", what, rest_count, rest);
+    }
+    if (freedom < 3) freedom = 3;
+    CHECK(sum <= check_chi_square_bound(freedom), "%s: chi square %.1f with %.0f degrees of freedom, allowed %.1f",
+          what, sum, freedom, check_chi_square_bound(freedom));
+}
+
 static inline double check_scale(void)
 {
     const char *text = getenv("METRO_TEST_SCALE");

@@ -24,15 +24,8 @@ static void *fuzz_make(size_t size)
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
-#include <string.h>
-
-#define FUZZ_DEMAND(condition)                                                                                       \
-    do {                                                                                                             \
-        if (!(condition)) {                                                                                          \
-            fprintf(stderr, "fuzz_pictures: %s does not hold\n", #condition);                                        \
-            abort();                                                                                                 \
-        }                                                                                                            \
-    } while (0)
+#define FUZZ_NAME "fuzz_pictures"
+#include "fuzz.h"
 
 /* What must hold for a picture that was read: the file was large enough for it, every sample can be touched, a PPM
    lies in 0 .. 1, and it equals itself. */
@@ -52,7 +45,6 @@ static void fuzz_good(const uint8_t *bytes, size_t size, const metro_image *imag
     FUZZ_DEMAND(finite < samples || difference.largest == 0);
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
 {
     metro_image image;
@@ -77,85 +69,19 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
 
 #ifdef FUZZ_STANDALONE
 
-enum { FUZZ_MOST = 256 };
-
-static int fuzz_file(const char *path)
-{
-    FILE *file = fopen(path, "rb");
-    static uint8_t bytes[1 << 20];
-    size_t size = file != NULL ? fread(bytes, 1, sizeof bytes, file) : 0;
-    if (file == NULL) {
-        fprintf(stderr, "fuzz_pictures: cannot open %s\n", path);
-        return 1;
-    }
-    fclose(file);
-    LLVMFuzzerTestOneInput(bytes, size);
-    return 0;
-}
-
-/* One small change: a byte, a bit, a digit, a piece taken out or doubled, the end cut off, a word of the format put
-   in. */
-static size_t fuzz_mutate(uint8_t *bytes, size_t size, metro_rng *rng)
-{
-    static const char *const word[] = { " 0 ", "18446744073709551616", "4294967296", "65536", "1e308", "-0.0", "nan",
-                                        "#", "\n", "P3", "PF", "Pf", "P6", "-1.0\n", " 1 1 ", "255 " };
-    size_t at = (size_t)metro_rng_below(rng, size + 1), length = (size_t)metro_rng_below(rng, 9), i;
-    const char *put = word[metro_rng_below(rng, sizeof word / sizeof *word)];
-    switch (metro_rng_below(rng, 7)) {
-    case 0: if (at < size) bytes[at] = (uint8_t)metro_rng_below(rng, 256); break;
-    case 1: if (at < size) bytes[at] ^= (uint8_t)(1u << metro_rng_below(rng, 8)); break;
-    case 2: if (at < size) bytes[at] = (uint8_t)('0' + metro_rng_below(rng, 10)); break;
-    case 3: return at;
-    case 4:
-        if (at + length > size) break;
-        memmove(bytes + at, bytes + at + length, size - at - length);
-        return size - length;
-    case 5:
-        if (at + length > size || size + length > FUZZ_MOST) break;
-        memmove(bytes + at + length, bytes + at, size - at);
-        return size + length;
-    default:
-        length = strlen(put);
-        if (size + length > FUZZ_MOST) break;
-        memmove(bytes + at + length, bytes + at, size - at);
-        for (i = 0; i < length; i++) bytes[at + i] = (uint8_t)put[i];
-        return size + length;
-    }
-    return size;
-}
-
-#define FUZZ_BYTES(text) { text, sizeof(text) - 1 }
-
 int main(int count, char **argument)
 {
-    static const struct {
-        const char *bytes;
-        size_t size;
-    } good[] = { FUZZ_BYTES("P6\n2 1\n255\n\1\2\3\4\5\6"), FUZZ_BYTES("P6\n1 1\n65535\n\1\2\3\4\5\6"),
-                 FUZZ_BYTES("P3\n2 2 # size\n15\n1 2 3 4 5 6 7 8 9 10 11 12\n"),
-                 FUZZ_BYTES("Pf\n2 1\n-1.0\n\0\0\x80\x3f\1\2\3\4"),
-                 FUZZ_BYTES("PF\n1 1\n1.0\n\x3f\x80\0\0\x7f\xc0\0\0\x7f\x80\0\0") };
-    const char *text = getenv("METRO_TEST_SCALE");
-    double scale = text != NULL ? atof(text) : 1.0;
-    long runs = (long)(200000 * (scale > 0 && scale < 1 ? scale : 1.0)), run;
-    metro_rng rng = metro_rng_make(8, 1);
-    int i, failed = 0;
-    for (i = 1; i < count; i++) failed |= fuzz_file(argument[i]);
-    for (run = 0; count == 1 && run < runs; run++) {
-        size_t chosen = (size_t)metro_rng_below(&rng, sizeof good / sizeof *good), size = good[chosen].size;
-        uint64_t changes = 1 + metro_rng_below(&rng, 4);
-        uint8_t bytes[FUZZ_MOST], *copy;
-        memcpy(bytes, good[chosen].bytes, size);
-        while (changes-- > 0) size = fuzz_mutate(bytes, size, &rng);
-        /* A block of exactly this size, so that a sanitizer sees a byte too many. */
-        copy = (uint8_t *)malloc(size > 0 ? size : 1);
-        if (copy == NULL) return 1;
-        memcpy(copy, bytes, size);
-        LLVMFuzzerTestOneInput(copy, size);
-        free(copy);
-    }
-    if (count == 1) printf("fuzz_pictures: %ld mutations, none failed\n", runs);
-    return failed;
+    static const char *const word[] = {
+        " 0 ", "18446744073709551616", "4294967296", "65536", "1e308", "-0.0", "nan", "#", "\n", "P3", "PF",
+        "Pf", "P6", "-1.0\n", " 1 1 ", "255 "
+    };
+    static const fuzz_text good[] = {
+        FUZZ_TEXT("P6\n2 1\n255\n\1\2\3\4\5\6"), FUZZ_TEXT("P6\n1 1\n65535\n\1\2\3\4\5\6"),
+        FUZZ_TEXT("P3\n2 2 # size\n15\n1 2 3 4 5 6 7 8 9 10 11 12\n"),
+        FUZZ_TEXT("Pf\n2 1\n-1.0\n\0\0\x80\x3f\1\2\3\4"),
+        FUZZ_TEXT("PF\n1 1\n1.0\n\x3f\x80\0\0\x7f\xc0\0\0\x7f\x80\0\0")
+    };
+    return fuzz_main(count, argument, good, sizeof good / sizeof *good, word, sizeof word / sizeof *word, 200000);
 }
 
 #endif

@@ -37,15 +37,8 @@ static void fuzz_free(void *block)
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
-#include <string.h>
-
-#define FUZZ_DEMAND(condition)                                                                                       \
-    do {                                                                                                             \
-        if (!(condition)) {                                                                                          \
-            fprintf(stderr, "fuzz_scenes: %s does not hold\n", #condition);                                          \
-            abort();                                                                                                 \
-        }                                                                                                            \
-    } while (0)
+#define FUZZ_NAME "fuzz_scenes"
+#include "fuzz.h"
 
 /* What must hold for a scene that was read: there are no more triangles than the file has room for, all materials
    exist and keep energy, the getters agree with each other, and the scene builds and answers a ray. */
@@ -111,7 +104,6 @@ static void fuzz_once(const uint8_t *bytes, size_t size, size_t left)
     FUZZ_DEMAND(fuzz_living == living);
 }
 
-int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size);
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
 {
     if (size == 0) return 0;
@@ -122,110 +114,25 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
 
 #ifdef FUZZ_STANDALONE
 
-enum { FUZZ_MOST = 1024 };
-
-static int fuzz_file(const char *path)
-{
-    FILE *file = fopen(path, "rb");
-    static uint8_t bytes[1 << 20];
-    size_t size = file != NULL ? fread(bytes, 1, sizeof bytes, file) : 0;
-    if (file == NULL) {
-        fprintf(stderr, "fuzz_scenes: cannot open %s\n", path);
-        return 1;
-    }
-    fclose(file);
-    LLVMFuzzerTestOneInput(bytes, size);
-    return 0;
-}
-
-/* One small change: a byte, a bit, a digit, a piece taken out or doubled, the end cut off, a word of the format put
-   in. */
-static size_t fuzz_mutate(uint8_t *bytes, size_t size, metro_rng *rng)
-{
-    static const char *const word[] = { "\nf 1 2 3 4\n",
-                                        "\nv 0 0 0\n",
-                                        " -1 ",
-                                        " 1e39 ",
-                                        "nan ",
-                                        "\\\n",
-                                        "\r\n",
-                                        "\nusemtl a\n",
-                                        "\nmtllib a b\n",
-                                        "\nnewmtl b\n",
-                                        "Kd ",
-                                        "\nKs 1 1 1\n",
-                                        "\n# camera eye ",
-                                        " look 1 2 3",
-                                        " -99999999999999999999",
-                                        "//1",
-                                        "\nKe 1e308",
-                                        "\nillum 7\n",
-                                        "\nd .5\n",
-                                        "\xef\xbb\xbf",
-                                        "#",
-                                        "\t",
-                                        " 2 3 1 4 2 1 3 3 4" };
-    size_t at = (size_t)metro_rng_below(rng, size + 1), length = (size_t)metro_rng_below(rng, 33), i;
-    const char *put = word[metro_rng_below(rng, sizeof word / sizeof *word)];
-    switch (metro_rng_below(rng, 7)) {
-    case 0: if (at < size) bytes[at] = (uint8_t)metro_rng_below(rng, 256); break;
-    case 1: if (at < size) bytes[at] ^= (uint8_t)(1u << metro_rng_below(rng, 8)); break;
-    case 2: if (at < size) bytes[at] = (uint8_t)('0' + metro_rng_below(rng, 10)); break;
-    case 3: return metro_rng_below(rng, 8) == 0 ? at : size;
-    case 4:
-        if (at + length > size) break;
-        memmove(bytes + at, bytes + at + length, size - at - length);
-        return size - length;
-    case 5:
-        if (at + length > size || size + length > FUZZ_MOST) break;
-        memmove(bytes + at + length, bytes + at, size - at);
-        return size + length;
-    default:
-        length = strlen(put);
-        if (size + length > FUZZ_MOST) break;
-        memmove(bytes + at + length, bytes + at, size - at);
-        for (i = 0; i < length; i++) bytes[at + i] = (uint8_t)put[i];
-        return size + length;
-    }
-    return size;
-}
-
-#define FUZZ_BYTES(text) { text, sizeof(text) - 1 }
-
 int main(int count, char **argument)
 {
-    static const struct {
-        const char *bytes;
-        size_t size;
-    } good[] = { FUZZ_BYTES("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n\0newmtl a\nKd .5 .5 .5\n"
-                            "Ks .25\nNs 20\nKe 1 2 3\nd 1\nillum 2\n"),
-                 FUZZ_BYTES("# camera eye 0 1 4 look 0 1 0 up 0 1 0 fov 40\r\nv 0 0 0\r\nv 4 0 0\r\nv 1 1 0\r\n"
-                            "v 0 4 0\r\nf -4/1/1 -3//1 -2/1 -1\r\n"),
-                 FUZZ_BYTES(
-                     "v 0 0 0\nv 4 0 0\nv 4 4 0\nv 0 4 0\nv 1 1 0\nv 1 3 0\nv 3 3 0\nv 3 1 0\nusemtl a\nf 1 2 3 4 1 "
-                     "5 6 7 8 5\nusemtl b b\nf 1 2 \\\n3\n\0newmtl b b\nKe 1\nnewmtl a\nmap_Kd a.png\nKd .8 .9 1\n"
-                     "Ks .5 .5 .5\n") };
-    const char *text = getenv("METRO_TEST_SCALE");
-    double scale = text != NULL ? atof(text) : 1.0;
-    long runs = (long)(100000 * (scale > 0 && scale < 1 ? scale : 1.0)), run;
-    metro_rng rng = metro_rng_make(9, 4);
-    int i, failed = 0;
-    for (i = 1; i < count; i++) failed |= fuzz_file(argument[i]);
-    for (run = 0; count == 1 && run < runs; run++) {
-        size_t chosen = (size_t)metro_rng_below(&rng, sizeof good / sizeof *good), size = good[chosen].size;
-        uint64_t changes = 1 + metro_rng_below(&rng, 6);
-        uint8_t bytes[FUZZ_MOST], *copy;
-        memcpy(bytes, good[chosen].bytes, size);
-        while (changes-- > 0) size = fuzz_mutate(bytes, size, &rng);
-        /* A block of exactly this size, so that a sanitizer sees a byte too many. */
-        copy = (uint8_t *)malloc(size > 0 ? size : 1);
-        if (copy == NULL) return 1;
-        memcpy(copy, bytes, size);
-        LLVMFuzzerTestOneInput(copy, size);
-        free(copy);
-    }
-    if (count == 1) printf("fuzz_scenes: %ld mutations, none failed\n", runs);
-    return failed;
+    static const char *const word[] = {
+        "\nf 1 2 3 4\n", "\nv 0 0 0\n", " -1 ", " 1e39 ", "nan ", "\\\n", "\r\n", "\nusemtl a\n",
+        "\nmtllib a b\n", "\nnewmtl b\n", "Kd ", "\nKs 1 1 1\n", "\n# camera eye ", " look 1 2 3",
+        " -99999999999999999999", "//1", "\nKe 1e308", "\nillum 7\n", "\nd .5\n", "\xef\xbb\xbf", "#", "\t",
+        " 2 3 1 4 2 1 3 3 4"
+    };
+    static const fuzz_text good[] = {
+        FUZZ_TEXT("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl a\nf 1 2 3\n\0newmtl a\nKd .5 .5 .5\n"
+                  "Ks .25\nNs 20\nKe 1 2 3\nd 1\nillum 2\n"),
+        FUZZ_TEXT("# camera eye 0 1 4 look 0 1 0 up 0 1 0 fov 40\r\nv 0 0 0\r\nv 4 0 0\r\nv 1 1 0\r\n"
+                  "v 0 4 0\r\nf -4/1/1 -3//1 -2/1 -1\r\n"),
+        FUZZ_TEXT(
+                  "v 0 0 0\nv 4 0 0\nv 4 4 0\nv 0 4 0\nv 1 1 0\nv 1 3 0\nv 3 3 0\nv 3 1 0\nusemtl a\nf 1 2 3 4 1 "
+                  "5 6 7 8 5\nusemtl b b\nf 1 2 \\\n3\n\0newmtl b b\nKe 1\nnewmtl a\nmap_Kd a.png\nKd .8 .9 1\n"
+                  "Ks .5 .5 .5\n")
+    };
+    return fuzz_main(count, argument, good, sizeof good / sizeof *good, word, sizeof word / sizeof *word, 100000);
 }
 
 #endif

@@ -1,5 +1,5 @@
-/* light.h - what the tests of chapters 11 to 14 share: small scenes made in code, a render in one call, and the chi
-   square. Include it after metro.h and check.h. */
+/* light.h - what the tests of chapters 11 to 14 share: small scenes made in code, and a render in one call. Include it
+   after metro.h and check.h. */
 
 #ifndef LIGHT_H
 #define LIGHT_H
@@ -7,33 +7,6 @@
 #define CHECK_PI 3.14159265358979323846
 
 /* ---- statistics ---- */
-
-/* Chi square of `count[i]` against samples * p[i]; cells that expect fewer than 10 are put together. A correct
-   program is refused once in a million. */
-static inline void chi_square(const char *what, const double *count, const double *p, int cells, double samples)
-{
-    double sum = 0, rest_count = 0, rest = 0, freedom = -1;
-    int i;
-    for (i = 0; i < cells; i++) {
-        double expected = samples * p[i];
-        if (expected < 10) {
-            rest_count += count[i];
-            rest += expected;
-            continue;
-        }
-        sum += (count[i] - expected) * (count[i] - expected) / expected;
-        freedom++;
-    }
-    if (rest > 2) {
-        sum += (rest_count - rest) * (rest_count - rest) / rest;
-        freedom++;
-    } else {
-        CHECK(rest_count <= 25, "%s: %g draws in cells that expect %g", what, rest_count, rest);
-    }
-    if (freedom < 3) freedom = 3;
-    CHECK(sum <= check_chi_square_bound(freedom), "%s: chi square %.1f with %.0f degrees of freedom, allowed %.1f",
-          what, sum, freedom, check_chi_square_bound(freedom));
-}
 
 /* How many standard errors a mean may be off when its error was estimated with `freedom` degrees of freedom, for the
    same false alarm as 5.1 of a known error: Student's quantile by Cornish and Fisher (1937). */

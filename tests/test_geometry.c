@@ -1,54 +1,13 @@
 /* test_geometry.c - chapter 9: triangles, materials, lamps, and scenes from OBJ and MTL.
 
    Small files are written out here as strings, some of them as the programs write them whose names they bear.
-   Polygons are judged by area, orientation and by points that must be covered exactly once. All memory goes through a
-   counter that can also fail: it shows what a file costs, and that nothing leaks. */
+   Polygons are judged by area, orientation and by points that must be covered exactly once. The counter of
+   memory shows what a file costs, and that nothing leaks. */
 
 #ifndef _XOPEN_SOURCE
 #define _XOPEN_SOURCE 700 /* mkdtemp, mkfifo, mkdir, realpath */
 #endif
-#include <stddef.h>
-#include <stdlib.h>
-
-typedef struct {
-    size_t living, made; /* blocks alive; blocks asked for since the last reset, larger ones included */
-    size_t bytes;        /* asked for since the last reset */
-    size_t fail_at;      /* the number of the block that is refused, from 1; 0: none */
-} memory_state;
-
-static memory_state memory_global = { 0, 0, 0, 0 };
-
-static void *memory_make(size_t size)
-{
-    void *block;
-    memory_global.made++;
-    memory_global.bytes += size;
-    if (memory_global.made == memory_global.fail_at) return NULL;
-    block = malloc(size);
-    memory_global.living += block != NULL;
-    return block;
-}
-
-static void memory_free(void *block)
-{
-    memory_global.living -= block != NULL;
-    free(block);
-}
-
-static void *memory_resize(void *block, size_t size, size_t *wrong)
-{
-    memory_global.made++;
-    memory_global.bytes += size;
-    *wrong += block == NULL;
-    if (memory_global.made == memory_global.fail_at) return NULL;
-    return realloc(block, size);
-}
-
-static size_t memory_wrong = 0; /* calls of REALLOC with NULL, which a user's allocator need not know */
-
-#define METRO_MALLOC(size) memory_make(size)
-#define METRO_REALLOC(pointer, size) memory_resize(pointer, size, &memory_wrong)
-#define METRO_FREE(pointer) memory_free(pointer)
+#include "memory.h"
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
@@ -59,13 +18,6 @@ static size_t memory_wrong = 0; /* calls of REALLOC with NULL, which a user's al
 #include <sys/types.h>
 #include <unistd.h>
 #endif
-
-static void memory_reset(size_t fail_at)
-{
-    memory_global.made = 0;
-    memory_global.bytes = 0;
-    memory_global.fail_at = fail_at;
-}
 
 /* ---- small helpers ---- */
 
@@ -125,14 +77,14 @@ static void refused(const char *obj, const char *mtl, const char *text)
 {
     metro_scene scene = nothing(), before;
     metro_vec3 corner[3] = { { 0, 0, 0 }, { 1, 0, 0 }, { 0, 1, 0 } };
-    size_t living = memory_global.living;
+    long living = allocations_live;
     static const metro_scene empty = { 0, 0, 0, 0, 0, 0, 0, { { 0, 0, 0 }, { 0, 0, 0 }, { 0, 0, 0 }, 0 },
                                        0, 0, 0, 0, 0, 0 };
     metro_result result = parse(&scene, obj, mtl);
     CHECK(result == METRO_ERROR_FORMAT, "%.40s: %s", obj, metro_result_text(result));
     CHECK_TOLD(text);
     CHECK(memcmp(&scene, &empty, sizeof scene) == 0, "%.40s: the empty scene has changed", obj);
-    CHECK(memory_global.living == living, "%.40s: %d blocks left", obj, (int)(memory_global.living - living));
+    CHECK(allocations_live == living, "%.40s: %ld blocks left", obj, allocations_live - living);
     metro_scene_add_triangle(&scene, corner, 0);
     before = scene;
     CHECK(parse(&scene, obj, mtl) == METRO_ERROR_FORMAT, "refused once only");
@@ -141,7 +93,7 @@ static void refused(const char *obj, const char *mtl, const char *text)
           "%.40s: the full scene has changed", obj);
     CHECK_VEC3(metro_scene_corner(&scene, 0, 1), 1, 0, 0);
     metro_scene_free(&scene);
-    CHECK(memory_global.living == living, "%.40s: %d blocks left", obj, (int)(memory_global.living - living));
+    CHECK(allocations_live == living, "%.40s: %ld blocks left", obj, allocations_live - living);
 }
 
 /* ---- scenes in code ---- */
@@ -340,7 +292,8 @@ static void lamps(void)
     static const metro_material blue = { { 0, 0, 0 }, { 0, 0, 0 }, 0, { 0, 0, 1e-9 } };
     metro_vec3 corner[3] = { { 0, 0, 0 }, { 1, 0, 0 }, { 0, 1, 0 } };
     uint32_t number[3];
-    size_t i, living = memory_global.living;
+    size_t i;
+    long living = allocations_live;
     double sum = 0, total = 0;
     CHECK(metroi_scene_lights(&scene) == METRO_OK && scene.light_count == 0 && scene.light == NULL, "no lamp");
     metro_scene_add_material(&scene, &red, &number[0]);
@@ -372,18 +325,18 @@ static void lamps(void)
     }
     CHECK(scene.light_sum[scene.light_count - 1] == 1.0, "the last sum is off 1");
     for (i = 1; i <= 2; i++) {
-        memory_reset(i);
+        allocations_reset((long)i - 1);
         CHECK(metroi_scene_lights(&scene) == METRO_ERROR_MEMORY, "block %d", (int)i);
         CHECK(scene.light == NULL && scene.light_sum == NULL && scene.light_count == 0, "half a list");
     }
-    memory_reset(0);
+    allocations_reset(-1);
     scene.material[0].ke.x = 1e308;
     corner[1].x = 1e20;
     corner[2].y = 1;
     metro_scene_add_triangle(&scene, corner, number[0]);
     CHECK(metroi_scene_lights(&scene) == METRO_ERROR_ARGUMENT && scene.light_count == 0, "an infinite power");
     metro_scene_free(&scene);
-    CHECK(memory_global.living == living, "blocks left");
+    CHECK(allocations_live == living, "blocks left");
 }
 
 /* ---- faces ---- */
@@ -933,13 +886,13 @@ static void odd_polygons(void)
                                (1 + (double)(i * 7919 % 1000)) * sin(6.28 * (double)i / (double)n));
     at += (size_t)snprintf(text + at, size - at, "f");
     for (i = 0; i < n; i++) at += (size_t)snprintf(text + at, size - at, " %d", (int)i + 1);
-    memory_reset(0);
+    allocations_reset(-1);
     scene = nothing();
     CHECK(parse(&scene, text, NULL) == METRO_OK && scene.triangle_count == n - 2, "%d triangles",
           (int)scene.triangle_count);
     CHECK(strstr(told, ": a polygon crosses itself") != NULL, "no warning: %s", told);
-    CHECK(memory_global.made < 200 && memory_global.bytes < 40 * size, "%d blocks, %.3g bytes for %.3g",
-          (int)memory_global.made, (double)memory_global.bytes, (double)at);
+    CHECK(allocations_made < 200 && allocations_bytes < 40 * size, "%ld blocks, %.3g bytes for %.3g",
+          allocations_made, (double)allocations_bytes, (double)at);
     metro_scene_free(&scene);
     free(text);
 }
@@ -1031,45 +984,44 @@ static void no_memory(void)
 {
     int full;
     for (full = 0; full < 2; full++) {
-        size_t k, before = memory_global.living;
+        long k, before = allocations_live;
         metro_result result = METRO_ERROR_MEMORY;
         for (k = 1; result == METRO_ERROR_MEMORY && k < 100; k++) {
             metro_scene scene = nothing();
             metro_vec3 corner[3] = { { 7, 0, 0 }, { 1, 0, 0 }, { 0, 1, 0 } };
-            memory_reset(0);
+            allocations_reset(-1);
             if (full) metro_scene_add_triangle(&scene, corner, 0);
-            memory_reset(k);
+            allocations_reset(k - 1);
             result = parse(&scene, EVERYTHING, "newmtl a\nKd .5\nnewmtl b\nd 0\n");
-            memory_reset(0);
+            allocations_reset(-1);
             if (result == METRO_ERROR_MEMORY) {
                 CHECK(strstr(told, "memory") != NULL, "\"%s\"", told);
                 CHECK(scene.triangle_count == (size_t)full && scene.material_count == 0 && !scene.has_camera,
-                      "block %d: the scene has changed", (int)k);
-                if (!full) CHECK(memory_global.living == before, "block %d: something stays", (int)k);
+                      "block %ld: the scene has changed", k);
+                if (!full) CHECK(allocations_live == before, "block %ld: something stays", k);
                 if (full) CHECK_VEC3(metro_scene_corner(&scene, 0, 0), 7, 0, 0);
             } else {
                 CHECK(result == METRO_OK && scene.triangle_count == 23 + (size_t)full, "%s", told);
             }
             metro_scene_free(&scene);
-            CHECK(memory_global.living == before, "block %d of %d: %d blocks left", (int)k, full,
-                  (int)(memory_global.living - before));
+            CHECK(allocations_live == before, "block %ld of %d: %ld blocks left", k, full,
+                  allocations_live - before);
         }
-        CHECK(result == METRO_OK && k > 10, "%d tries, %s", (int)k, metro_result_text(result));
+        CHECK(result == METRO_OK && k > 10, "%ld tries, %s", k, metro_result_text(result));
     }
-    CHECK(memory_wrong == 0, "%d calls of REALLOC with NULL", (int)memory_wrong);
 }
 
 /* The same for scenes made in code. Catches: a count that goes up though the list did not grow. */
 static void no_memory_in_code(void)
 {
-    size_t k, before = memory_global.living;
+    long k, before = allocations_live;
     for (k = 1; k < 6; k++) {
         metro_scene scene = nothing();
         metro_vec3 corner[3] = { { 7, 0, 0 }, { 1, 0, 0 }, { 0, 1, 0 } };
         metro_material material;
         uint32_t index = 0, failed = 0, i;
         memset(&material, 0, sizeof material);
-        memory_reset(k);
+        allocations_reset(k - 1);
         for (i = 0; i < 20; i++) {
             size_t triangles = scene.triangle_count, materials = scene.material_count;
             if (metro_scene_add_triangle(&scene, corner, 0) != METRO_OK) {
@@ -1082,16 +1034,16 @@ static void no_memory_in_code(void)
             }
         }
         CHECK(failed == 1 && scene.triangle_count + scene.material_count == 39, "%d failed", (int)failed);
-        memory_reset(0);
+        allocations_reset(-1);
         metro_scene_free(&scene);
     }
-    CHECK(memory_global.living == before, "blocks left");
+    CHECK(allocations_live == before, "blocks left");
     {
         metro_scene scene = nothing();
         metro_vec3 corner[3] = { { 7, 0, 0 }, { 1, 0, 0 }, { 0, 1, 0 } };
         scene.triangle_count = scene.triangle_room = 0xffffffffu; /* a full scene, without its lists */
-        memory_reset(0);
-        CHECK(metro_scene_add_triangle(&scene, corner, 0) == METRO_ERROR_MEMORY && memory_global.made == 0,
+        allocations_reset(-1);
+        CHECK(metro_scene_add_triangle(&scene, corner, 0) == METRO_ERROR_MEMORY && allocations_made == 0,
               "2^32 triangles");
     }
 }
@@ -1104,12 +1056,12 @@ static void memory_is_linear(void)
     metro_scene scene = nothing();
     if (text == NULL) return;
     for (i = 0; i < n; i++) at += (size_t)snprintf(text + at, size - at, "v %d 0 1\nmtllib m\nf -1 1 -1\n", (int)i);
-    memory_reset(0);
+    allocations_reset(-1);
     CHECK(parse(&scene, text, "") == METRO_OK && scene.triangle_count == n, "%s", told);
     /* 40 bytes a triangle and 12 a vertex, lists that grow by half, then are trimmed: at most four times as much. */
-    CHECK(memory_global.bytes < 4 * 52 * n + 2 * at + 5000, "%d bytes", (int)memory_global.bytes);
+    CHECK(allocations_bytes < 4 * 52 * n + 2 * at + 5000, "%d bytes", (int)allocations_bytes);
     CHECK(scene.triangle_room == n, "room for %d triangles is kept", (int)scene.triangle_room);
-    CHECK(memory_global.made < 120, "%d blocks", (int)memory_global.made);
+    CHECK(allocations_made < 120, "%ld blocks", allocations_made);
     metro_scene_free(&scene);
     free(text);
 }
@@ -1142,7 +1094,7 @@ static void loads(const char *text, const char *message, size_t materials)
     metro_scene scene = nothing();
     char expected[600];
     metro_result result;
-    size_t living = memory_global.living;
+    long living = allocations_live;
     write_text("room.obj", text);
     snprintf(expected, sizeof expected, message, folder, folder);
     memset(told, '?', sizeof told);
@@ -1152,7 +1104,7 @@ static void loads(const char *text, const char *message, size_t materials)
     CHECK(scene.material_count == materials, "%s: %d materials", text, (int)scene.material_count);
     if (materials > 0 && scene.material_count > 0) CHECK(scene.material[0].kd.x == 0.25, "another material");
     metro_scene_free(&scene);
-    CHECK(memory_global.living == living, "%d blocks left", (int)(memory_global.living - living));
+    CHECK(allocations_live == living, "%ld blocks left", allocations_live - living);
 }
 
 static void fails(const char *name, metro_result wanted, const char *message)
@@ -1160,12 +1112,12 @@ static void fails(const char *name, metro_result wanted, const char *message)
     metro_scene scene = nothing();
     char expected[600];
     metro_result result;
-    size_t living = memory_global.living;
+    long living = allocations_live;
     snprintf(expected, sizeof expected, message, folder, folder);
     result = metro_scene_load_obj(&scene, in_folder(name), told, sizeof told);
     CHECK(result == wanted, "%s: %s", name, metro_result_text(result));
     CHECK_TOLD(expected);
-    CHECK(scene.corner == NULL && scene.triangle_count == 0 && memory_global.living == living, "something stays");
+    CHECK(scene.corner == NULL && scene.triangle_count == 0 && allocations_live == living, "something stays");
 }
 
 #define USE_A "v 0 0 0\nusemtl a\nf 1 1 1\n"
@@ -1220,10 +1172,10 @@ static void libraries_are_read_once(void)
     for (i = 0; i < n; i++)
         at += (size_t)snprintf(text + at, size - at, i % 2 == 0 ? "mtllib a.mtl\n" : "mtllib no%d a.mtl\n", (int)i);
     snprintf(text + at, size - at, USE_A);
-    memory_reset(0);
+    allocations_reset(-1);
     loads(text, "", 1);
     /* One block each for 2500 lines and 2500 words that name nothing, and few others. */
-    CHECK(memory_global.made < n + n / 10, "%d blocks for %d lines", (int)memory_global.made, (int)n);
+    CHECK(allocations_made < (long)(n + n / 10), "%ld blocks for %d lines", allocations_made, (int)n);
     free(text);
 }
 
@@ -1245,22 +1197,22 @@ static void files_that_fail(void)
 
 static void no_memory_for_files(void)
 {
-    size_t k, before = memory_global.living;
+    long k, before = allocations_live;
     metro_result result = METRO_ERROR_MEMORY;
     write_text("d.mtl", "newmtl a\nKd .5\nnewmtl b\nd 0\n");
     write_text("all.obj", "mtllib no such thing\nmtllib x/d.mtl\n" EVERYTHING);
     for (k = 1; result == METRO_ERROR_MEMORY && k < 100; k++) {
         metro_scene scene = nothing();
-        memory_reset(k);
+        allocations_reset(k - 1);
         result = metro_scene_load_obj(&scene, in_folder("all.obj"), told, sizeof told);
-        memory_reset(0);
+        allocations_reset(-1);
         CHECK(result == METRO_OK ||
                   (strstr(told, "all.obj: ") != NULL && strstr(told, "memory for the scene") != NULL),
               "\"%s\"", told);
-        CHECK(result == METRO_OK || memory_global.living == before, "block %d: something stays", (int)k);
+        CHECK(result == METRO_OK || allocations_live == before, "block %ld: something stays", k);
         metro_scene_free(&scene);
     }
-    CHECK(result == METRO_OK && k > 15 && memory_global.living == before, "%d tries", (int)k);
+    CHECK(result == METRO_OK && k > 15 && allocations_live == before, "%ld tries", k);
 }
 
 static void file_tests(void)
@@ -1335,7 +1287,7 @@ static void numbers_come_back(void)
 
 int main(void)
 {
-    size_t living = memory_global.living;
+    long living = allocations_live;
     CHECK_RUN(materials);
     CHECK_RUN(triangles);
     CHECK_RUN(after_the_build);
@@ -1364,6 +1316,6 @@ int main(void)
 #ifndef _WIN32
     file_tests();
 #endif
-    if (memory_global.living != living) fprintf(stderr, "geometry: %d blocks left\n", (int)memory_global.living);
+    if (allocations_live != living) fprintf(stderr, "geometry: %ld blocks left\n", allocations_live);
     return check_done("geometry");
 }

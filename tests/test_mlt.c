@@ -331,7 +331,7 @@ static void perturbation_sizes(void)
             CHECK(most[i] <= apex / 2 * (1 + 0.02) && most[i] >= apex / 2 * (1 - 0.03),
                   "%s: part %d moves by %g, should be up to %g", one ? "one" : "all", i, most[i], apex / 2);
         for (i = 0; i < 8; i++) p[i] = 1.0 / 8;
-        if (one) chi_square("what is moved", moved, p, 8, 20000);
+        if (one) check_chi_square("what is moved", moved, p, 8, 20000);
         else
             for (i = 0; i < 8; i++) CHECK(moved[i] == 20000, "part %d moved %g times", i, moved[i]);
         metro_render_free(&render);

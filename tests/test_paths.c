@@ -950,8 +950,8 @@ static void even_points(void)
         }
     }
     for (k = 0; k < 64; k++) p[k] = 1.0 / 64;
-    chi_square("film points over pixels", count, p, 64, 8.0 * pixel);
-    chi_square("film and bounce of one path", joint, p, 64, pixel);
+    check_chi_square("film points over pixels", count, p, 64, 8.0 * pixel);
+    check_chi_square("film and bounce of one path", joint, p, 64, pixel);
 }
 
 /* What evenness is for. */
@@ -1070,6 +1070,7 @@ static void allocations_fail(void)
         allocations_left = 0;
         CHECK(metro_render_run(&render, 1, NULL, NULL) == METRO_ERROR_MEMORY && render.rounds == 3,
               "no memory for a round");
+        allocations_left = 0;
         CHECK(metro_render_image(&render, &image) == METRO_ERROR_MEMORY, "no memory for an image");
         allocations_left = -1;
         image = render_image(&render);

@@ -365,32 +365,6 @@ static void density_symmetry(void)
 
 /* --- Draws against densities ------------------------------------------------------------------------------------ */
 
-/* Chi square of `count[i]` against samples * p[i]; cells that expect fewer than 10 are put together. */
-static void chi_square(const char *what, const double *count, const double *p, int cells, double samples)
-{
-    double sum = 0, rest_count = 0, rest = 0, freedom = -1;
-    int i;
-    for (i = 0; i < cells; i++) {
-        double expected = samples * p[i];
-        if (expected < 10) {
-            rest_count += count[i];
-            rest += expected;
-            continue;
-        }
-        sum += (count[i] - expected) * (count[i] - expected) / expected;
-        freedom++;
-    }
-    if (rest > 2) {
-        sum += (rest_count - rest) * (rest_count - rest) / rest;
-        freedom++;
-    } else {
-        CHECK(rest_count <= 25, "%s: %g draws in cells that expect %g", what, rest_count, rest);
-    }
-    if (freedom < 3) freedom = 3;
-    CHECK(sum <= check_chi_square_bound(freedom), "%s: chi square %.1f with %.0f degrees of freedom, allowed %.1f",
-          what, sum, freedom, check_chi_square_bound(freedom));
-}
-
 #define CELLS 48
 
 /* Draws `k` from `x` into CELLS cells over [0, 1], or over a window around x when the kernel is narrow; the cell
@@ -432,7 +406,7 @@ static void draw_against_density(metro_kernel k, double x, int reflect, uint64_t
     /* what lies outside the window */
     CHECK(window < 1 || total == 0, "%s: %g draws outside", what, total);
     if (window < 1) CHECK_SIGMA(total, (double)samples * (1 - mass), sqrt((double)samples * fabs(1 - mass)) + 3);
-    chi_square(what, count, p, CELLS, (double)samples);
+    check_chi_square(what, count, p, CELLS, (double)samples);
 }
 
 /* Catches: a clamped border, a dropped wrap or fold, a Gaussian of the wrong width, a wrong kappa, a missing sign,
@@ -578,9 +552,9 @@ static void sphere_draws(double size, int fisher, int a, uint64_t stream)
         count[1][j < 0 ? 0 : j > 23 ? 23 : j]++;
     }
     snprintf(what, sizeof what, "height of %s %g around axis %d", fisher ? "vmf" : "cone", size, a);
-    chi_square(what, count[0], p, 24, (double)samples);
+    check_chi_square(what, count[0], p, 24, (double)samples);
     snprintf(what, sizeof what, "azimuth of %s %g around axis %d", fisher ? "vmf" : "cone", size, a);
-    chi_square(what, count[1], p, 24, (double)samples);
+    check_chi_square(what, count[1], p, 24, (double)samples);
 }
 
 /* Catches: the apex angle in place of the half angle, uniform theta in place of uniform height, a frame that fails at

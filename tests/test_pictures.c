@@ -6,47 +6,7 @@
 #ifndef _POSIX_C_SOURCE
 #define _POSIX_C_SOURCE 200809L /* fork, kill, symlink */
 #endif
-#include <stddef.h>
-#include <stdlib.h>
-
-typedef struct {
-    size_t living, made, bytes; /* blocks alive; blocks and bytes asked for since the last reset */
-    size_t fail_at;             /* the number of the block that is refused, from 1; 0: none */
-} memory_state;
-
-static memory_state memory_global = { 0, 0, 0, 0 };
-
-static void *memory_make(size_t size)
-{
-    void *block;
-    memory_global.made++;
-    memory_global.bytes += size;
-    if (memory_global.made == memory_global.fail_at) return NULL;
-    block = malloc(size);
-    memory_global.living += block != NULL;
-    return block;
-}
-
-static void memory_free(void *block)
-{
-    memory_global.living -= block != NULL;
-    free(block);
-}
-
-static void *memory_resize(void *block, size_t size)
-{
-    void *moved;
-    if (block == NULL) return memory_make(size);
-    memory_global.made++;
-    memory_global.bytes += size;
-    if (memory_global.made == memory_global.fail_at) return NULL;
-    moved = realloc(block, size);
-    return moved;
-}
-
-#define METRO_MALLOC(size) memory_make(size)
-#define METRO_REALLOC(pointer, size) memory_resize(pointer, size)
-#define METRO_FREE(pointer) memory_free(pointer)
+#include "memory.h"
 
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
@@ -62,13 +22,6 @@ static void *memory_resize(void *block, size_t size)
 #include <time.h>
 #include <unistd.h>
 #endif
-
-static void memory_reset(size_t fail_at)
-{
-    memory_global.made = 0;
-    memory_global.bytes = 0;
-    memory_global.fail_at = fail_at;
-}
 
 /* ---- small helpers ---- */
 
@@ -132,7 +85,8 @@ static int exists(const char *path)
 static void make_and_free(void)
 {
     metro_image image = nothing(), same;
-    size_t i, living = memory_global.living;
+    size_t i;
+    long living = allocations_live;
     CHECK(metro_image_make(5, 4, 3, &image) == METRO_OK, "a small picture was refused");
     CHECK(image.width == 5 && image.height == 4 && image.channels == 3, "wrong shape");
     for (i = 0; i < 60; i++) CHECK(image.value[i] == 0.0, "sample %d is not black", (int)i);
@@ -142,18 +96,18 @@ static void make_and_free(void)
     CHECK(metro_image_make(4, 4, 0, &image) == METRO_ERROR_ARGUMENT, "no channels");
     CHECK(metro_image_make(4, 4, 2, &image) == METRO_ERROR_ARGUMENT, "two channels");
     CHECK(metro_image_make(4, 4, 3, NULL) == METRO_ERROR_ARGUMENT, "no picture");
-    memory_reset(0);
+    allocations_reset(-1);
     CHECK(metro_image_make(SIZE_MAX, SIZE_MAX, 3, &image) == METRO_ERROR_MEMORY, "SIZE_MAX squared");
     CHECK(metro_image_make(SIZE_MAX / 2 + 1, 2, 1, &image) == METRO_ERROR_MEMORY, "wraps to 0");
     CHECK(metro_image_make(SIZE_MAX / 8 + 2, 1, 1, &image) == METRO_ERROR_MEMORY, "bytes wrap to 8");
     CHECK(metro_image_make(SIZE_MAX / 24 + 2, 1, 3, &image) == METRO_ERROR_MEMORY, "bytes wrap");
-    CHECK(memory_global.made == 0, "an overflowing size reached the allocator");
+    CHECK(allocations_made == 0, "an overflowing size reached the allocator");
     CHECK(memcmp(&same, &image, sizeof image) == 0, "a failure changed the picture");
     metro_image_free(&image);
     CHECK(image.value == NULL && image.width == 0 && image.height == 0 && image.channels == 0, "not emptied");
     metro_image_free(&image);
     metro_image_free(NULL);
-    CHECK(memory_global.living == living, "%d blocks leaked", (int)(memory_global.living - living));
+    CHECK(allocations_live == living, "%ld blocks leaked", allocations_live - living);
 }
 
 /* ---- colour ---- */
@@ -397,23 +351,24 @@ static void refuses(void)
         { BYTES("Pf 3 1 -1.0\n\0\0\0\0\0\0\0\0\0\0\0"), "before its last pixel" },
         { BYTES("Pf 2 1 -1.0\n\0\0\0\0\0\0\0\0\0\0\0\0"), "after its last pixel" },
     };
-    size_t i, living = memory_global.living;
+    size_t i;
+    long living = allocations_live;
     for (i = 0; i < sizeof bad / sizeof *bad; i++) {
         metro_image image = nothing(), same;
         char message[200] = "";
         metro_result result;
         image.width = 77;
         same = image;
-        memory_reset(0);
+        allocations_reset(-1);
         result = parse(bad[i].bytes, bad[i].size, &image, message, sizeof message);
         CHECK(result == METRO_ERROR_FORMAT, "case %d (%s) gave result %d", (int)i, bad[i].bytes, (int)result);
-        CHECK(memory_global.made == 0, "case %d (%s) allocated", (int)i, bad[i].bytes);
+        CHECK(allocations_made == 0, "case %d (%s) allocated", (int)i, bad[i].bytes);
         CHECK(strlen(message) > 20 && strstr(message, bad[i].reason) != NULL, "case %d (%s): %s", (int)i,
               bad[i].bytes, message);
         CHECK(memcmp(&image, &same, sizeof image) == 0, "case %d (%s) changed the picture", (int)i, bad[i].bytes);
         if (result == METRO_OK) metro_image_free(&image);
     }
-    CHECK(memory_global.living == living, "leaked");
+    CHECK(allocations_live == living, "leaked");
 }
 
 /* Every beginning of a good file is a bad file, and reads nothing beyond its end (the copy has exactly its size, so
@@ -611,7 +566,7 @@ static void unwritable(void)
     metro_image image = random_picture(3, 2, 3), read = nothing();
     char message[300], path[400];
     int k;
-    size_t living = memory_global.living;
+    long living = allocations_live;
     snprintf(path, sizeof path, "%s", scratch("missing.pfm"));
     CHECK(metro_image_load(path, &read, message, sizeof message) == METRO_ERROR_FILE, "a missing file was read");
     CHECK(strstr(message, path) == message && strstr(message, "exists") != NULL, "the message is: %s", message);
@@ -630,7 +585,7 @@ static void unwritable(void)
         CHECK(save[k](&image, path) == METRO_ERROR_FILE, "written into a file");
         remove(scratch("plain"));
     }
-    CHECK(memory_global.living == living, "leaked");
+    CHECK(allocations_live == living, "leaked");
     metro_image_free(&image);
 }
 
@@ -725,38 +680,38 @@ static void every_allocation_fails(void)
 {
     metro_image image = random_picture(4, 3, 3), made = nothing();
     char path[300], out[300], message[400];
-    size_t k, living = memory_global.living;
+    long k, living = allocations_live;
     snprintf(path, sizeof path, "%s", scratch("memory.pfm"));
     snprintf(out, sizeof out, "%s", scratch("memory.out"));
     CHECK(metro_image_save_pfm(&image, path) == METRO_OK, "cannot write %s", path);
     for (k = 1;; k++) {
         metro_image read = nothing();
         metro_result result;
-        memory_reset(k);
+        allocations_reset(k - 1);
         result = metro_image_load(path, &read, message, sizeof message);
-        if (memory_global.made < k) {
-            CHECK(result == METRO_OK && k == 3, "two blocks were expected, not %d", (int)k - 1);
+        if (allocations_made < k) {
+            CHECK(result == METRO_OK && k == 3, "two blocks were expected, not %ld", k - 1);
             metro_image_free(&read);
             break;
         }
-        CHECK(result == METRO_ERROR_MEMORY && strstr(message, "memory") != NULL, "load, block %d: %d", (int)k,
+        CHECK(result == METRO_ERROR_MEMORY && strstr(message, "memory") != NULL, "load, block %ld: %d", k,
               (int)result);
-        CHECK(read.value == NULL && read.width == 0 && memory_global.living == living, "load, block %d: not clean",
-              (int)k);
+        CHECK(read.value == NULL && read.width == 0 && allocations_live == living, "load, block %ld: not clean",
+              k);
     }
     for (k = 1;; k++) {
         metro_result pfm, ppm;
-        memory_reset(k);
+        allocations_reset(k - 1);
         pfm = metro_image_save_pfm(&image, out);
-        if (memory_global.made < k) break;
-        memory_reset(k);
+        if (allocations_made < k) break;
+        allocations_reset(k - 1);
         ppm = metro_image_save_ppm(&image, out);
-        CHECK(pfm == METRO_ERROR_MEMORY && ppm == METRO_ERROR_MEMORY, "save, block %d", (int)k);
-        CHECK(!exists(out) && memory_global.living == living, "save, block %d: not clean", (int)k);
+        CHECK(pfm == METRO_ERROR_MEMORY && ppm == METRO_ERROR_MEMORY, "save, block %ld", k);
+        CHECK(!exists(out) && allocations_live == living, "save, block %ld: not clean", k);
     }
-    memory_reset(1);
+    allocations_reset(0);
     CHECK(metro_image_make(3, 3, 1, &made) == METRO_ERROR_MEMORY && made.value == NULL, "make");
-    memory_reset(0);
+    allocations_reset(-1);
     remove(path);
     remove(out);
     metro_image_free(&image);
@@ -777,9 +732,9 @@ static void refused_file_is_cheap(void)
     snprintf(path, sizeof path, "%s", scratch("lie"));
     for (i = 0; i < sizeof lie / sizeof *lie; i++) {
         CHECK(write_bytes(path, lie[i].bytes, lie[i].size), "cannot write %s", path);
-        memory_reset(0);
+        allocations_reset(-1);
         CHECK(metro_image_load(path, &image, NULL, 0) == METRO_ERROR_FORMAT, "lie %d was believed", (int)i);
-        CHECK(memory_global.bytes <= lie[i].size + 1, "lie %d cost %d bytes", (int)i, (int)memory_global.bytes);
+        CHECK(allocations_bytes <= lie[i].size + 1, "lie %d cost %d bytes", (int)i, (int)allocations_bytes);
     }
     remove(path);
 }
@@ -928,7 +883,7 @@ static void error_of_nonsense(void)
 
 static void nothing_leaked(void)
 {
-    CHECK(memory_global.living == 0, "%d blocks are still alive", (int)memory_global.living);
+    CHECK(allocations_live == 0, "%ld blocks are still alive", allocations_live);
 }
 
 /* A program that writes the same file over and over is killed at some moment. Catches: a picture written in place, of
@@ -966,7 +921,6 @@ static void killed_run(void)
 
 int main(void)
 {
-    (void)memory_resize; /* for the header's chapters that grow a block */
     CHECK_RUN(make_and_free);
     CHECK_RUN(srgb_curve);
     CHECK_RUN(luminance);
