@@ -1055,8 +1055,9 @@ METRO_API metro_result metro_image_parse(const unsigned char *bytes, size_t size
    and `Pf` for one. NaN and infinity are kept; a magnitude beyond what a float holds (3.4e38) becomes infinity. The
    bytes are the same on every machine and in every locale. The file appears whole or not at all: it is written as
    `path` with `.tmp` appended (a file of that name is replaced) and renamed when all of it has arrived. What is there
-   already and is no ordinary file, /dev/stdout for one, is written directly. Returns METRO_ERROR_FILE when it cannot
-   be written, and then an older file at `path` is as it was, METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT (an empty
+   already and is no ordinary file, and what is in /dev, /dev/stdout for one, is written directly; a link is replaced
+   by the file, and the file has the rights that any file made there gets. Returns METRO_ERROR_FILE when it cannot be
+   written, and then an older file at `path` is as it was, METRO_ERROR_MEMORY, or METRO_ERROR_ARGUMENT (an empty
    picture, `channels` not 1 or 3, a NULL). */
 METRO_API metro_result metro_image_save_pfm(const metro_image *image, const char *path);
 
@@ -1088,7 +1089,8 @@ typedef struct {
 
 /* Compares `image` with `reference`, which has the same size and channels. A NaN or an infinity in either picture
    makes the sums NaN or infinite, as it must; one NaN and `largest` is NaN and names its pixel. A black reference
-   gives infinity, or NaN where the picture is black too. Returns METRO_ERROR_ARGUMENT when the pictures differ in
+   makes the first infinite, or NaN if the picture is black too, and the second NaN if they have a black pixel in
+   common. Returns METRO_ERROR_ARGUMENT when the pictures differ in
    shape, are empty or NULL, and then `difference` is unchanged. Cost: linear. */
 METRO_API metro_result metro_image_error(const metro_image *image, const metro_image *reference,
                                          metro_image_difference *difference);
@@ -1108,6 +1110,8 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
        metro_scene scene = { 0 };
        metro_scene_load_obj(&scene, "room.obj", message, sizeof message);
        metro_scene_build(&scene);
+       ...
+       metro_scene_free(&scene);
 
    Coordinates are right-handed. A triangle (p0, p1, p2) has the normal (p1 - p0) x (p2 - p0); it reflects and emits
    on the side that its normal points to, and its back is black. Colours are vectors too: x is red, y green, z blue.
@@ -1163,7 +1167,8 @@ METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_
 
    A polygon of n corners makes n - 2 triangles: a convex one, or any that can be seen whole from its first corner,
    the fan from there; any other the ears that are cut off it in its own plane. Polygons without area, or with a
-   corner that is not finite, are kept as triangles that nothing hits. Read are `v`, `f`, `usemtl`, `mtllib`; of an
+   corner that is not finite, are fans, of which the triangles without area, or with such a corner, are never hit. A
+   face uses vertices that stand above it. Read are `v`, `f`, `usemtl`, `mtllib`; of an
    MTL file `newmtl`, `Kd`, `Ks`, `Ns`, `Ke` (one number for all colours, or three). What a material does not say is
    0, except that one with neither Kd nor Ke has the Kd of material 0. The camera stands in a comment, of which the
    last one counts:
@@ -1172,7 +1177,8 @@ METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_
 
    Returns METRO_OK, METRO_ERROR_FILE (the OBJ cannot be read), METRO_ERROR_FORMAT (a line is wrong, or there is no
    face at all), METRO_ERROR_MEMORY or METRO_ERROR_ARGUMENT (a NULL, or a scene that is built already). Then the scene
-   is unchanged, nothing stays allocated, and `message` says what is wrong, as "FILE:LINE: what". On success it holds
+   is unchanged, nothing stays allocated, and `message` says what is wrong, as "FILE:LINE: what", or
+   "FILE: what" where no line is to blame. On success it holds
    the warnings, one a line, and each kind once, with the place where it was met first: an MTL file or a material that
    is missing (material 0 stands in); Kd above 1 (taken as 1), Kd + Ks above 1 (Ks is taken as 1 - Kd), a negative
    number (taken as 0); a transparency (d, Tr), texture (map_) or illumination model (illum) that would change the
@@ -1184,9 +1190,9 @@ METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_
    them. */
 METRO_API metro_result metro_scene_load_obj(metro_scene *scene, const char *path, char *message, size_t message_size);
 
-/* The same from `obj_size` bytes of OBJ at `obj` and `mtl_size` bytes of MTL at `mtl`, which stand for all MTL files
-   that the OBJ names; `mtl` may be NULL with size 0. No file is opened. Places in `message` begin with "obj:" or
-   "mtl:". Costs a copy of the bytes. */
+/* The same from `obj_size` bytes of OBJ at `obj` and `mtl_size` bytes of MTL at `mtl`, which stand for the MTL files
+   of the OBJ, whether it names any or not; `mtl` may be NULL with size 0. No file is opened. Places in `message`
+   begin with "obj:" or "mtl:". Costs a copy of the bytes. */
 METRO_API metro_result metro_scene_parse_obj(metro_scene *scene, const unsigned char *obj, size_t obj_size,
                                              const unsigned char *mtl, size_t mtl_size, char *message,
                                              size_t message_size);
@@ -8791,7 +8797,7 @@ static size_t metroi_text_digits(metroi_text *text, uint64_t *digits, long *powe
         int byte = metroi_text_peek(text);
         if (byte == '.' && !point) {
             point = 1;
-        } else if (metroi_is_digit(byte) && count < 1000) {
+        } else if (metroi_is_digit(byte)) {
             int fits = *digits < UINT64_C(1000000000000000000);
             if (fits) *digits = 10 * *digits + (uint64_t)(byte - '0');
             *power += (fits ? 0 : 1) - (point ? 1 : 0);
@@ -8806,8 +8812,7 @@ static size_t metroi_text_digits(metroi_text *text, uint64_t *digits, long *powe
 static int metroi_text_real(metroi_text *text, double *number)
 {
     uint64_t digits = 0;
-    long power = 0, sign;
-    size_t exponent;
+    long power = 0, exponent = 0, sign;
     metroi_text_skip(text);
     sign = metroi_text_peek(text) == '-' ? -1 : 1;
     if (sign < 0 || metroi_text_peek(text) == '+') text->at++;
@@ -8817,9 +8822,10 @@ static int metroi_text_real(metroi_text *text, double *number)
         text->at++;
         down = metroi_text_peek(text) == '-';
         if (down || metroi_text_peek(text) == '+') text->at++;
-        /* White space here would let `1e 5` through. */
-        if (!metroi_is_digit(metroi_text_peek(text)) || !metroi_text_whole(text, 9999, &exponent)) return 0;
-        power += down ? -(long)exponent : (long)exponent;
+        if (!metroi_is_digit(metroi_text_peek(text))) return 0;
+        for (; metroi_is_digit(metroi_text_peek(text)); text->at++)
+            if (exponent < 100000) exponent = 10 * exponent + (text->bytes[text->at] - '0');
+        power += down ? -exponent : exponent;
     }
     if (!metroi_text_ends(text)) return 0;
     *number = (double)sign * metroi_decimal(digits, power);
@@ -8840,8 +8846,8 @@ static int metroi_text_real(metroi_text *text, double *number)
    first.
 
    A file is a claim that somebody else makes, so we believe nothing before it is checked: the header, then that all
-   samples are there and that nothing but white space follows them. Only then are the pixels allocated. What is wrong
-   goes back as a sentence in `why`. */
+   samples are there and that nothing follows them but the end of a line, or in a P3 white space. Only then are the
+   pixels allocated. What is wrong goes back as a sentence in `why`. */
 
 typedef struct {
     int is_float, is_text, is_big;   /* PFM; P3; PFM with the high byte first */
@@ -8946,7 +8952,7 @@ static const char *metroi_raster_check(metroi_text text, const metroi_header *he
         if (why != NULL) return why;
     }
     if (header->is_text) metroi_text_skip(&text);
-    while (metroi_is_blank(metroi_text_peek(&text))) text.at++;
+    else if (metroi_text_peek(&text) == '\n') text.at++;
     return text.at < text.size ? "the file goes on after its last pixel: the size in its header is wrong" : NULL;
 }
 
@@ -9061,7 +9067,8 @@ METRO_API metro_result metro_image_load(const char *path, metro_image *image, ch
    A long run that is killed while it saves, or a disk that is full, must not leave half a picture where a whole one
    was. So we write a sibling, `PATH.tmp`, and rename it when every byte has arrived: within a folder a rename happens
    at once or not at all. A device or a pipe is not replaced (a program that runs as root would otherwise put a file
-   where /dev/null was) but written to. */
+   where /dev/null was) but written to; nor is anything in /dev and /proc, where /dev/stdout leads to an ordinary file
+   if the shell says so. */
 
 typedef struct {
     FILE *file;
@@ -9080,6 +9087,7 @@ static int metroi_is_special(const char *path)
 static int metroi_is_special(const char *path)
 {
     struct stat status;
+    if (strncmp(path, "/dev/", 5) == 0 || strncmp(path, "/proc/", 6) == 0) return 1;
     return stat(path, &status) == 0 && !S_ISREG(status.st_mode);
 }
 #endif
@@ -9108,26 +9116,37 @@ static metro_result metroi_output_close(metroi_output *output)
     good = fclose(output->file) == 0 && good;
     if (output->sibling != NULL) {
 #ifdef _WIN32
-        if (good) remove(output->path); /* rename does not replace there */
-#endif
+        if (good) remove(output->path); /* rename does not replace there; when it fails, the sibling stays */
+        if (good && rename(output->sibling, output->path) != 0) {
+            METRO_FREE(output->sibling);
+            return METRO_ERROR_FILE;
+        }
+#else
         good = good && rename(output->sibling, output->path) == 0;
+#endif
         if (!good) remove(output->sibling);
         METRO_FREE(output->sibling);
     }
     return good ? METRO_OK : METRO_ERROR_FILE;
 }
 
-/* The four bytes of a float, the low one first. A double beyond the range of float has no defined conversion. */
-static void metroi_write_float(double value, unsigned char byte[4])
+/* The nearest float. A double beyond their range has no defined conversion; the upper half of the last step rounds to
+   infinity. */
+static float metroi_float(double value)
 {
     const double largest = 3.4028234663852886e38; /* (2 - 2^-23) 2^127 */
-    float single = 0;
+    const double end = 3.4028235677973366e38;     /* (2 - 2^-24) 2^127 */
+    if (fabs(value) >= end) return value > 0 ? (float)METROI_INFINITY : -(float)METROI_INFINITY;
+    if (fabs(value) > largest) return value > 0 ? (float)largest : -(float)largest;
+    return (float)value;
+}
+
+/* The four bytes of a float, the low one first. */
+static void metroi_write_float(double value, unsigned char byte[4])
+{
+    float single = metroi_float(value);
     uint32_t bits;
-    if (fabs(value) > largest) bits = value > 0 ? 0x7f800000u : 0xff800000u;
-    else {
-        single = (float)value;
-        memcpy(&bits, &single, sizeof bits);
-    }
+    memcpy(&bits, &single, sizeof bits);
     byte[0] = (unsigned char)(bits & 255);
     byte[1] = (unsigned char)(bits >> 8 & 255);
     byte[2] = (unsigned char)(bits >> 16 & 255);
@@ -9186,8 +9205,6 @@ METRO_API metro_result metro_image_save_ppm(const metro_image *image, const char
    Two numbers, because each hides something. The relative root mean square error compares energies: a lamp in the
    picture decides it alone.
 
-   [figure: picture_sheet.svg | What a chain has seen of a picture after more and more mutations.]
-
        epsilon = sqrt{frac{sum (I - R)^2}{sum R^2}}                                   (8.4)
 
    relMSE weighs each pixel by its own brightness, as the eye does. With $X$ the luminance of the picture and $Y$ that
@@ -9195,6 +9212,8 @@ METRO_API metro_result metro_image_save_ppm(const metro_image *image, const char
 
        "relMSE" = frac{1}{n} sum_{j=1}^{n} frac{(X_j - Y_j)^2}{Y_j^2 + 0.01 m^2},
        m = frac{1}{n} sum_{j=1}^{n} Y_j                                               (8.5)
+
+   [figure: picture_sheet.svg | What a chain has seen of a picture after more and more mutations.]
 
    A reference is itself a long run, and where it is off by its own noise of variance $V_j$ the error of even a
    perfect picture is not 0 but, in the mean,
@@ -9291,9 +9310,8 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
 
    A corner is three floats. Rounding it once, when it is added, and taking everything from the rounded numbers means
    that the ray tracer, the lamps and the normals all speak of the same triangle: no light leaks where two of them
-   would disagree by a digit. What is computed from the corners is computed in double. The product of two edges has at
-   most twice the digits of a float and a size between 1e-90 and 1e78, so its square neither overflows nor vanishes,
-   and no scaling is needed.
+   would disagree by a digit. What is computed from the corners is computed in double. The product of two edges
+   has a size between 1e-90 and 1e78, so its square neither overflows nor vanishes, and no scaling is needed.
 
    These small functions are asked at every hit, and what is METROI_INLINE is inlined where it is used. Vectors then
    stay in registers, which makes the walks of chapter 12 up to a tenth faster. */
@@ -9363,7 +9381,7 @@ static const metro_material *metroi_scene_material(const metro_scene *scene, uin
 
 METROI_COLD
 
-/* The faces that these show to a user know the borders of their lists. */
+/* For users the same is public, and checks what it is asked for. */
 
 METRO_API const metro_material *metro_scene_material(const metro_scene *scene, uint32_t material)
 {
@@ -9441,15 +9459,6 @@ static metro_result metroi_scene_grow(metro_scene *scene, size_t more)
     return METRO_OK;
 }
 
-/* A double beyond the range of float has no defined conversion. */
-
-static float metroi_float(double value)
-{
-    const double largest = 3.4028234663852886e38; /* (2 - 2^-23) 2^127 */
-    if (value > largest) return (float)INFINITY;
-    return value < -largest ? -(float)INFINITY : (float)value;
-}
-
 METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_vec3 corner[3], uint32_t material)
 {
     metro_result result;
@@ -9505,7 +9514,7 @@ METRO_API metro_result metro_scene_add_material(metro_scene *scene, const metro_
 
 /* # 9.3 What a scene is as a whole
 
-   Its box, over the triangles that can be hit. */
+   Its box, over the triangles that are finite. */
 
 METRO_API metro_result metro_scene_bounds(const metro_scene *scene, metro_vec3 *low, metro_vec3 *high)
 {
@@ -9535,7 +9544,8 @@ METRO_API metro_result metro_scene_bounds(const metro_scene *scene, metro_vec3 *
 
        d = frac{r}{sin("fov"/2)}                                                      (9.2)
 
-   and the field of view is that cone at its narrowest. A scene that is a single point is given a radius of 1. */
+   and the vertical angle fov is the narrowest of a picture that is not higher than wide. A scene that is a single
+   point is given a radius of 1. */
 
 METRO_API metro_result metro_scene_frame(const metro_scene *scene, metro_camera *camera)
 {
@@ -9625,11 +9635,12 @@ typedef struct {
     int are_joined;        /* some lines go on below */
 } metroi_lines;
 
-/* Is the place `at` in a line that begins with `#`? Each line is looked back into at most once, from its end. */
+/* Is the place `at` behind a `#` that begins a word of its line? Each line is looked back into at most once, from its
+   end. */
 static int metroi_in_comment(const unsigned char *bytes, size_t at)
 {
-    while (at > 0 && bytes[at - 1] != '\n' && bytes[at - 1] != '\v') at--;
-    while (bytes[at] == ' ' || bytes[at] == '\t') at++;
+    for (; at > 0 && bytes[at - 1] != '\n' && bytes[at - 1] != '\v'; at--)
+        if (bytes[at] == '#' && metroi_is_blank(bytes[at - 1])) return 1;
     return bytes[at] == '#';
 }
 
@@ -9638,9 +9649,12 @@ static int metroi_lines_even(unsigned char *bytes, size_t size)
 {
     size_t i, end;
     int joined = 0;
-    if (size > 0 && memchr(bytes, '\n', size) == NULL)
-        for (i = 0; i < size; i++)
-            if (bytes[i] == '\r') bytes[i] = '\n';
+    for (i = 0; i < size; i++) {
+        const void *found = memchr(bytes + i, '\r', size - i);
+        if (found == NULL) break;
+        i = (size_t)((const unsigned char *)found - bytes);
+        if (i + 1 == size || (bytes[i + 1] != '\n' && bytes[i + 1] != '\r')) bytes[i] = '\n';
+    }
     if (size >= 3 && memcmp(bytes, "\xef\xbb\xbf", 3) == 0) memset(bytes, ' ', 3);
     for (i = 0; i < size; i++) {
         const void *found = memchr(bytes + i, '\\', size - i);
@@ -9801,7 +9815,8 @@ typedef struct {
     metroi_slice slice;
     size_t line;       /* where it was met first */
     uint32_t material; /* the number in the scene; 0 until it is defined */
-    int is_defined;
+    int is_defined;    /* a material in an MTL file; an MTL file that could be read */
+    int is_tried;      /* an MTL file */
 } metroi_name;
 
 typedef struct {
@@ -9914,6 +9929,7 @@ typedef struct {
     size_t vertices, vertex_room;
     size_t *corner; /* [corners]: the vertices of the polygon being read */
     size_t corners, corner_room;
+    int64_t ear_work; /* what cutting ears may still cost */
     metroi_names materials, libraries;
     metroi_slice wanted; /* the name after `usemtl` */
     size_t wanted_line;
@@ -9932,13 +9948,18 @@ static void metroi_reader_free(metroi_reader *reader)
     metroi_names_free(&reader->libraries);
 }
 
-/* A coordinate. Programs that divided by zero write `nan` or `-inf`, which are kept as NaN: a broken vertex should
-   not cost the whole scene. Returns 0 where there is no number. */
+/* A coordinate. Programs that divided by zero write `nan`, `-inf` or `-1.#IND`, which are kept as NaN: a broken
+   vertex should not cost the whole scene. Returns 0 where there is no number. */
 static int metroi_line_coordinate(metroi_text *line, double *number)
 {
     size_t start = line->at;
     int byte;
-    if (metroi_text_real(line, number)) return 1;
+    if (metroi_text_real(line, number)) {
+        if (metroi_text_peek(line) != '#' || line->bytes[line->at - 1] != '.') return 1;
+        while (metroi_text_peek(line) >= 0 && !metroi_is_blank(metroi_text_peek(line))) line->at++;
+        *number = METROI_NAN;
+        return 1;
+    }
     line->at = start;
     metroi_text_skip(line);
     byte = metroi_text_peek(line);
@@ -9966,7 +9987,8 @@ static metro_result metroi_read_vertex(metroi_reader *reader)
     place = reader->vertex + 3 * reader->vertices;
     for (k = 0; k < 3; k++) {
         if (!metroi_line_coordinate(&reader->lines.line, &number))
-            return metroi_notes_refuse(&reader->notes, &reader->lines, "a vertex (v) needs three numbers");
+            return metroi_notes_refuse(&reader->notes, &reader->lines,
+                                       "a vertex (v) needs three numbers such as 0.5 -1 2e-3");
         place[k] = metroi_float(number);
         finite = finite && isfinite(place[k]);
     }
@@ -9976,10 +9998,12 @@ static metro_result metroi_read_vertex(metroi_reader *reader)
     return METRO_OK;
 }
 
-/* A vertex that is not there: the message says how many are. */
-static metro_result metroi_refuse_corner(metroi_reader *reader)
+/* A vertex that is not there: the message says which, and how many are. */
+static metro_result metroi_refuse_corner(metroi_reader *reader, metroi_slice number)
 {
-    metroi_notes_refuse(&reader->notes, &reader->lines, "a face (f) uses a vertex that is not there: ");
+    metroi_notes_refuse(&reader->notes, &reader->lines, "a face (f) uses the vertex ");
+    metroi_notes_slice(&reader->notes, number);
+    metroi_notes_add(&reader->notes, ", which is not there: ");
     metroi_notes_number(&reader->notes, reader->vertices);
     metroi_notes_add(&reader->notes, reader->vertices == 1 ? " stands above it" : " stand above it");
     return METRO_ERROR_FORMAT;
@@ -9992,17 +10016,20 @@ static metro_result metroi_read_corner(metroi_reader *reader, size_t *vertex)
     metroi_text *line = &reader->lines.line;
     size_t number = 0, digits = 0;
     int back = metroi_text_peek(line) == '-';
+    metroi_slice word;
+    word.text = line->bytes + line->at;
     if (back) line->at++;
     for (; metroi_is_digit(metroi_text_peek(line)); digits++, line->at++)
         if (number <= SIZE_MAX / 20) number = 10 * number + (size_t)(line->bytes[line->at] - '0');
     if (digits == 0 || (metroi_text_peek(line) != '/' && !metroi_text_ends(line)))
         return metroi_notes_refuse(&reader->notes, &reader->lines,
                                    "a corner of a face (f) is not a whole number such as 3, 3/1, 3//2 or -1");
+    word.length = digits + (size_t)back;
     while (!metroi_text_ends(line)) line->at++;
     if (number == 0)
         return metroi_notes_refuse(&reader->notes, &reader->lines,
                                    "a face (f) uses vertex 0; the first vertex is number 1");
-    if (number > reader->vertices) return metroi_refuse_corner(reader);
+    if (number > reader->vertices) return metroi_refuse_corner(reader, word);
     *vertex = back ? reader->vertices - number : number - 1;
     return METRO_OK;
 }
@@ -10054,6 +10081,7 @@ typedef struct {
     size_t *corner; /* [count]: what is left of the polygon */
     size_t count;
     int across, up; /* the two axes that are kept */
+    int64_t work;   /* corners looked at and moved */
 } metroi_polygon;
 
 /* Twice the area of the triangle of three vertices in the plane: positive when it goes round counterclockwise. */
@@ -10123,15 +10151,18 @@ static int metroi_polygon_turns_back(const metroi_polygon *polygon, size_t a, si
 
 /* Is the corner after corner i an ear? A hole is written as a polygon with a cut from its border to the hole, whose
    ends are there twice: a corner at the same place as one of the three does not spoil the ear. The tip of a spike
-   without width goes at once, since an ear beside it would not be one; any other corner in line with its neighbours
-   only where no ear is left (`flat`), since the polygon next door may have a corner there too. */
-static int metroi_polygon_is_ear(const metroi_polygon *polygon, size_t i, int flat)
+   without width goes at once, since an ear beside it would not be one. Any other corner in line with its neighbours
+   stays while there are ears (`flat` says that there are none): the polygon next door may share it, and an edge that
+   runs past it would leave a crack. */
+static int metroi_polygon_is_ear(metroi_polygon *polygon, size_t i, int flat)
 {
     size_t a = polygon->corner[i], b = metroi_polygon_at(polygon, i, 1), c = metroi_polygon_at(polygon, i, 2), j;
     double turn = metroi_polygon_turn(polygon, a, b, c);
+    polygon->work++;
     if (!(turn > 0)) return turn == 0 && (flat || metroi_polygon_turns_back(polygon, a, b, c));
     for (j = 0; j < polygon->count; j++) {
         size_t d = polygon->corner[j];
+        polygon->work++;
         if (metroi_polygon_turn(polygon, a, b, d) < 0 || metroi_polygon_turn(polygon, b, c, d) < 0
             || metroi_polygon_turn(polygon, c, a, d) < 0)
             continue;
@@ -10148,21 +10179,21 @@ static void metroi_polygon_cut_ear(metroi_reader *reader, metroi_polygon *polygo
     size_t ear = i + 1 < polygon->count ? i + 1 : 0;
     metroi_reader_triangle(reader, polygon->corner[i], polygon->corner[ear], metroi_polygon_at(polygon, i, 2));
     polygon->count--;
+    polygon->work += (int64_t)((polygon->count - ear) / 8);
     memmove(polygon->corner + ear, polygon->corner + ear + 1, (polygon->count - ear) * sizeof *polygon->corner);
 }
 
-/* Cuts ears until a triangle is left, or no ear is found, or the work exceeds what a polygon of so many corners may
-   cost: to look at a corner costs a step for each of the others, and a file of one polygon with a million corners
-   should not take a day. The bound lets a polygon of a thousand corners pass in most shapes. */
+/* Cuts ears until a triangle is left, or no ear is found, or the work exceeds what the polygons so far may cost: to
+   know an ear may take a look at every other corner, and a file of one polygon with a million corners should not take
+   a day. A spiral of a thousand corners costs four million looks. */
 
-enum { METROI_EAR_WORK = 2000 };
+enum { METROI_EAR_WORK = 2000, METROI_EAR_SPARE = 100000000 };
 
 static void metroi_polygon_cut(metroi_reader *reader, metroi_polygon *polygon)
 {
-    uint64_t most = (uint64_t)METROI_EAR_WORK * polygon->count, work = 0;
     size_t misses = 0, i = 0;
-    while (polygon->count > 3 && misses < 2 * polygon->count && work < most) {
-        work += polygon->count;
+    reader->ear_work += METROI_EAR_WORK * (int64_t)polygon->count;
+    while (polygon->count > 3 && misses < 2 * polygon->count && polygon->work < reader->ear_work) {
         if (i >= polygon->count) i = 0;
         if (metroi_polygon_is_ear(polygon, i, misses >= polygon->count)) {
             metroi_polygon_cut_ear(reader, polygon, i);
@@ -10172,6 +10203,7 @@ static void metroi_polygon_cut(metroi_reader *reader, metroi_polygon *polygon)
             i++;
         }
     }
+    reader->ear_work -= polygon->work;
 }
 
 /* Splits the polygon that was read. The last triangle, and what ears could not be cut from, is a fan. */
@@ -10183,12 +10215,14 @@ static metro_result metroi_reader_split(metroi_reader *reader)
     polygon.vertex = reader->vertex;
     polygon.corner = reader->corner;
     polygon.count = reader->corners;
+    polygon.work = 0;
     if (polygon.count > 3 && metroi_polygon_flatten(&polygon) && !metroi_polygon_is_fan(&polygon)) {
         metroi_polygon_cut(reader, &polygon);
         if (polygon.count > 3
             && metroi_notes_warn(&reader->notes, METROI_WARN_CROSSED, reader->lines.file, reader->lines.number))
             metroi_notes_add(&reader->notes,
-                             "a polygon crosses itself or is too intricate: it may be covered wrongly");
+                             "a polygon crosses itself or is too intricate: it may be covered wrongly; cut it into "
+                             "triangles in the program that wrote the file");
     }
     for (i = 1; i + 1 < polygon.count; i++)
         metroi_reader_triangle(reader, polygon.corner[0], polygon.corner[i], polygon.corner[i + 1]);
@@ -10346,10 +10380,11 @@ static void metroi_read_ignored(metroi_draft *draft, metroi_text *line)
         if (metroi_text_real(line, &number) && number > 0 && number < 1) draft->is_clear = 1;
     } else if (metroi_line_word(line, "illum")) {
         if (metroi_text_real(line, &number)) draft->illum = number;
-    } else if (metroi_line_word(line, "bump") || metroi_line_word(line, "norm") || metroi_line_word(line, "disp")) {
+    } else if (metroi_line_word(line, "bump") || metroi_line_word(line, "norm") || metroi_line_word(line, "disp")
+               || metroi_line_word(line, "refl")) {
         draft->has_texture = 1;
-    } else if (line->size - line->at > 4 && memcmp(line->bytes + line->at, "map_", 4) == 0) {
-        draft->has_texture = draft->has_texture || !metroi_line_word(line, "map_Ka");
+    } else if (!metroi_line_word(line, "map_Ka") && !metroi_line_word(line, "map_aat")) {
+        draft->has_texture |= line->size - line->at > 4 && memcmp(line->bytes + line->at, "map_", 4) == 0;
     }
 }
 
@@ -10458,7 +10493,7 @@ static metro_result metroi_read_mtl(metroi_reader *reader, const char *file, uns
             metroi_draft_open(reader, &draft, &lines);
         } else if (draft.name != NULL && !metroi_read_mtl_line(&draft, &lines.line)) {
             return metroi_notes_refuse(&reader->notes, &lines,
-                                       "Kd, Ks and Ke need one or three numbers, and Ns needs one");
+                                       "Kd, Ks and Ke need one or three finite numbers, and Ns needs one");
         }
     }
     return metroi_draft_close(reader, &draft, file);
@@ -10466,9 +10501,9 @@ static metro_result metroi_read_mtl(metroi_reader *reader, const char *file, uns
 
 /* # 9.11 Finding the MTL file
 
-   `mtllib` names files from the folder of the OBJ. Where a name cannot be opened we try what people meant: the words
-   of the line, since it may name several files (though most programs mean one whose name has blanks); and the last
-   part of the path, since scenes move from the machine where they were made to another. */
+   `mtllib` names files from the folder of the OBJ. Where a name cannot be opened we try what people meant: the last
+   part of the path, since scenes move from the machine where they were made to another; and the words of the line,
+   since it may name several files, though most programs mean one whose name has blanks. */
 
 static int metroi_is_slash(int byte)
 {
@@ -10513,7 +10548,7 @@ static metro_result metroi_library_read(metroi_reader *reader, metroi_slice name
     return result;
 }
 
-/* The same file is read once, however often it is named. A name that was tried has the material number 1. */
+/* The same file is read once, however often it is named. */
 static metro_result metroi_library_try(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
 {
     size_t number = metroi_names_add(&reader->libraries, slice, line);
@@ -10521,61 +10556,79 @@ static metro_result metroi_library_try(metroi_reader *reader, metroi_slice slice
     metroi_name *name;
     if (number == 0) return METRO_ERROR_MEMORY;
     name = &reader->libraries.name[number - 1];
-    if (name->material == 0) {
+    if (!name->is_tried) {
         result = metroi_library_read(reader, slice, &name->is_defined);
-        name->material = 1;
+        name->is_tried = 1;
     }
     *found = *found || name->is_defined;
     return result;
 }
 
-/* The words of a line, one by one. */
-static metro_result metroi_library_words(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
+/* A path, or else its last part beside the OBJ. */
+static metro_result metroi_library_search(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
 {
-    size_t at = 0;
-    while (at < slice.length) {
-        metroi_slice word;
-        metro_result result;
-        word.text = slice.text + at;
-        word.length = 0;
-        while (at < slice.length && !metroi_is_blank(slice.text[at])) {
-            at++;
-            word.length++;
-        }
-        while (at < slice.length && metroi_is_blank(slice.text[at])) at++;
-        result = metroi_library_try(reader, word, line, found);
-        if (result != METRO_OK) return result;
-    }
-    return METRO_OK;
-}
-
-/* The last part of a path. */
-static metro_result metroi_library_last(metroi_reader *reader, metroi_slice slice, size_t line, int *found)
-{
-    metroi_slice last = slice;
+    metro_result result = metroi_library_try(reader, slice, line, found);
     size_t at = slice.length;
     while (at > 0 && !metroi_is_slash(slice.text[at - 1])) at--;
-    last.text = slice.text + at;
-    last.length = slice.length - at;
-    if (at == 0 || last.length == 0) return METRO_OK;
-    return metroi_library_try(reader, last, line, found);
+    slice.text += at;
+    slice.length -= at;
+    if (result != METRO_OK || *found || at == 0 || slice.length == 0) return result;
+    return metroi_library_try(reader, slice, line, found);
 }
 
+/* The next word of `rest`, which keeps what stands behind it. */
+static metroi_slice metroi_slice_word(metroi_slice *rest)
+{
+    metroi_slice word = *rest;
+    size_t at = 0;
+    while (at < rest->length && !metroi_is_blank(rest->text[at])) at++;
+    word.length = at;
+    while (at < rest->length && metroi_is_blank(rest->text[at])) at++;
+    rest->text += at;
+    rest->length -= at;
+    return word;
+}
+
+/* Does the line name several files? Then more than one of its words ends in `.mtl`. */
+static int metroi_library_is_list(metroi_slice rest)
+{
+    int ends = 0;
+    while (rest.length > 0) {
+        metroi_slice word = metroi_slice_word(&rest);
+        const unsigned char *end = word.text + word.length;
+        if (word.length < 4 || end[-4] != '.') continue;
+        ends += (end[-3] | 32) == 'm' && (end[-2] | 32) == 't' && (end[-1] | 32) == 'l';
+    }
+    return ends > 1;
+}
+
+/* Of several files each must be found; words that make one name are only a guess, and one of them will do. */
 static metro_result metroi_read_library(metroi_reader *reader, metroi_slice slice, size_t line)
 {
-    int found = 0;
-    metro_result result = metroi_library_try(reader, slice, line, &found);
-    if (result == METRO_OK && !found) result = metroi_library_words(reader, slice, line, &found);
-    if (result == METRO_OK && !found) result = metroi_library_last(reader, slice, line, &found);
+    metroi_slice rest = slice, missing = slice;
+    int is_list = metroi_library_is_list(slice), found = 0, lacks = 0;
+    metro_result result = is_list ? metroi_library_try(reader, slice, line, &found)
+                                  : metroi_library_search(reader, slice, line, &found);
     if (result != METRO_OK || found) return result;
+    while (rest.length > 0) {
+        metroi_slice word = metroi_slice_word(&rest);
+        int here = 0;
+        result = metroi_library_search(reader, word, line, &here);
+        if (result != METRO_OK) return result;
+        if (is_list && !here && !lacks) missing = word;
+        lacks = lacks || !here;
+        found = found || here;
+    }
+    if (is_list ? !lacks : found) return METRO_OK;
     if (metroi_notes_warn(&reader->notes, METROI_WARN_LIBRARY, reader->lines.file, line)) {
-        metroi_notes_add(&reader->notes, "the MTL file cannot be read: ");
-        metroi_notes_slice(&reader->notes, slice);
+        metroi_notes_add(&reader->notes, "the MTL file cannot be read (put it beside the OBJ, or correct mtllib): ");
+        metroi_notes_slice(&reader->notes, missing);
     }
     return METRO_OK;
 }
 
-/* All MTL files, in the order of the lines that name them; words that are tried on the way stand behind these. */
+/* All MTL files, in the order of the lines that name them. Names that are tried on the way join the list behind
+   these, and are not visited here. */
 static metro_result metroi_read_libraries(metroi_reader *reader)
 {
     size_t i, lines = reader->libraries.count;
@@ -10677,6 +10730,7 @@ static metro_result metroi_scene_read(metro_scene *scene, metroi_reader *reader,
 static void metroi_reader_make(metroi_reader *reader, const char *file, char *message, size_t message_size)
 {
     memset(reader, 0, sizeof *reader);
+    reader->ear_work = METROI_EAR_SPARE;
     reader->lines.file = file;
     reader->notes.message = message;
     reader->notes.size = message_size;

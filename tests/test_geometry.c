@@ -391,6 +391,8 @@ static void lines_of_all_kinds(void)
         "usemtl red wall # a # comment\nv 0 \\\n0 0\nv 1 0 \\\r\n 0\nv 1 1 0\nv\\\n0\\\n1\\\n0\nf 1 2 \\\n3 \\\n 4\n",
         "# C:\\rooms\\\nusemtl red wall\n  # C:\\\r\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n\\",
         "\n\n#\nusemtl red wall\n\t\n#v 5 5 5\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n\n\n",
+        "usemtl red wall # C:\\tex\\\nv 0 0 0 # C:\\\nv 1 0 0 #C:\\\r\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n",
+        "mtllib a.mtl\rusemtl red wall\rv 0 0 0\rv 1 \\\r0 0\rv 1 1 0\r\r\nv 0 1 0\rf 1 2 3 4\r\n",
     };
     size_t i;
     for (i = 0; i < sizeof file / sizeof *file; i++) {
@@ -404,9 +406,10 @@ static void lines_of_all_kinds(void)
         metro_scene_free(&scene);
     }
     refused("v 0 0 0\nv 1 \\\n 0 \\\r\n 0\n\nf 1 2 9\n", NULL,
-            "obj:6: a face (f) uses a vertex that is not there: 2 stand above it");
-    refused("v 0 0 0\n#\\\nf 1 1 9\n", NULL, "obj:3: a face (f) uses a vertex that is not there: 1 stands above it");
-    refused("v 0 0 \\\n\n", NULL, "obj:1: a vertex (v) needs three numbers");
+            "obj:6: a face (f) uses the vertex 9, which is not there: 2 stand above it");
+    refused("v 0 0 0\n#\\\nf 1 1 9\n", NULL,
+            "obj:3: a face (f) uses the vertex 9, which is not there: 1 stands above it");
+    refused("v 0 0 \\\n\n", NULL, "obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
     refused("v 0 0 0\rf 1 1 0\r", NULL, "obj:2: a face (f) uses vertex 0; the first vertex is number 1");
 }
 
@@ -620,33 +623,35 @@ static void errors(void)
 {
     const char *not_whole = "obj:2: a corner of a face (f) is not a whole number such as 3, 3/1, 3//2 or -1";
     const char *none = "obj: there is no face (f) in the file; is it an OBJ file?";
-    const char *color = "mtl:2: Kd, Ks and Ke need one or three numbers, and Ns needs one";
+    const char *color = "mtl:2: Kd, Ks and Ke need one or three finite numbers, and Ns needs one";
     refused("", NULL, none);
     refused("v 0 0 0\nv 1 0 0\nl 1 2\n", NULL, none);
     refused("v 0 0 0\nf 1 1\n", NULL, none);
     refused("\x7f\x45LF\x02\x01\x01 and so on", NULL, none);
-    refused("v 0 0\n", NULL, "obj:1: a vertex (v) needs three numbers");
-    refused("#\nv\n", NULL, "obj:2: a vertex (v) needs three numbers");
-    refused("v 0 0 x\n", NULL, "obj:1: a vertex (v) needs three numbers");
-    refused("v 0 0 1x\n", NULL, "obj:1: a vertex (v) needs three numbers");
-    refused("v 0,5 0 1\n", NULL, "obj:1: a vertex (v) needs three numbers");
+    refused("v 0 0\n", NULL, "obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
+    refused("#\nv\n", NULL, "obj:2: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
+    refused("v 0 0 x\n", NULL, "obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
+    refused("v 0 0 1x\n", NULL, "obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
+    refused("v 0,5 0 1\n", NULL, "obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
     refused("v 0 0 0\nf 1 1 x\n", NULL, not_whole);
     refused("v 0 0 0\nf 1 1 1.5\n", NULL, not_whole);
     refused("v 0 0 0\nf 1 1 -\n", NULL, not_whole);
     refused("v 0 0 0\nf 1 1 /1\n", NULL, not_whole);
     refused("v 0 0 0\nf 1 1 1a\n", NULL, not_whole);
     refused("v 0 0 0\nf 1 0 1\n", NULL, "obj:2: a face (f) uses vertex 0; the first vertex is number 1");
-    refused("v 0 0 0\nf 1 2 1\n", NULL, "obj:2: a face (f) uses a vertex that is not there: 1 stands above it");
+    refused("v 0 0 0\nf 1 2 1\n", NULL, "obj:2: a face (f) uses the vertex 2, which is not there: 1 stands above it");
     refused("v 0 0 0\nv 0 0 0\nf 1 -3 1\n", NULL,
-            "obj:3: a face (f) uses a vertex that is not there: 2 stand above it");
-    refused("f 1 2 3\nv 0 0 0\n", NULL, "obj:1: a face (f) uses a vertex that is not there: 0 stand above it");
+            "obj:3: a face (f) uses the vertex -3, which is not there: 2 stand above it");
+    refused("f 1 2 3\nv 0 0 0\n", NULL, "obj:1: a face (f) uses the vertex 1, which is not there: 0 stand above it");
     refused("v 0 0 0\nf 1 1 4294967297\n", NULL,
-            "obj:2: a face (f) uses a vertex that is not there: 1 stands above it");
+            "obj:2: a face (f) uses the vertex 4294967297, which is not there: 1 stands above it");
     refused("v 0 0 0\nf 1 1 18446744073709551617\n", NULL,
-            "obj:2: a face (f) uses a vertex that is not there: 1 stands above it");
+            "obj:2: a face (f) uses the vertex 18446744073709551617, which is not there: 1 stands above it");
     refused("v 0 0 0\nf 1 1 100000000000000000000000000000000000000000001\n", NULL,
-            "obj:2: a face (f) uses a vertex that is not there: 1 stands above it");
-    refused(FACE "f 1 2\nf 1 2 9\n", NULL, "obj:7: a face (f) uses a vertex that is not there: 3 stand above it");
+            "obj:2: a face (f) uses the vertex 100000000000000000000000000000000000000000001,"
+            " which is not there: 1 stands above it");
+    refused(FACE "f 1 2\nf 1 2 9\n", NULL,
+            "obj:7: a face (f) uses the vertex 9, which is not there: 3 stand above it");
     refused(FACE "f 1 2\n", "newmtl a\nKd\n", color);
     refused(FACE, "newmtl a\nKd\n", color);
     refused(FACE, "newmtl a\nKd 1 2\n", color);
@@ -814,7 +819,7 @@ static void concave_polygons(void)
                                        { 3, 2 }, { 1.5, 1 }, { 1.5, 1 }, { 0, 2 } };
     static const point2 spike[7] = { { 0, 0 }, { 4, 0 }, { 4, 3 }, { 2, 1 }, { 2, 2 }, { 2, 1 }, { 0, 3 } };
     metro_rng rng = metro_rng_make(9, 2);
-    point2 q[200];
+    static point2 q[1000];
     int i, n;
     for (i = 0; i < 6; i++) { /* the planes of the axes, from both sides */
         metro_vec3 right = metro_vec3_make(i % 3 == 0, i % 3 == 1, i % 3 == 2);
@@ -848,6 +853,14 @@ static void concave_polygons(void)
         q[119 - i].y = (radius + 0.8) * sin(angle);
     }
     cover_all("spiral", q, 120, &rng);
+    for (i = 0; i < 500; i++) { /* a long one, many times round */
+        double angle = 6.283185307179586 * i / 40, radius = 1 + 0.2 * i;
+        q[i].x = radius * cos(angle);
+        q[i].y = radius * sin(angle);
+        q[999 - i].x = (radius + 2) * cos(angle);
+        q[999 - i].y = (radius + 2) * sin(angle);
+    }
+    cover("long spiral", q, 1000, &rng);
     for (n = 5; n < 200; n += 3) { /* stars with arms of random length */
         for (i = 0; i < n; i++) {
             double angle = 6.283185307179586 * i / n, radius = 0.05 + metro_rng_uniform(&rng);
@@ -865,7 +878,8 @@ static void odd_polygons(void)
     metro_scene scene;
     size_t i, n = 50000, size = 64 * n, at = 0;
     char *text = (char *)malloc(size);
-    const char *crossed = "obj:6: a polygon crosses itself or is too intricate: it may be covered wrongly";
+    const char *crossed = "obj:6: a polygon crosses itself or is too intricate: it may be covered wrongly; cut it "
+                          "into triangles in the program that wrote the file";
     scene = good("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\nf 1 1 2 2\nf 1 1 1\nf 1 2 1 2 1 2\n", NULL, 9, 0);
     metro_scene_free(&scene);
     scene = warned("v 6 8 0\nv 1 7 0\nv 4 8 0\nv 8 2 0\nv 8 1 0\nf 1 2 3 4 5\n", NULL, crossed);
@@ -874,6 +888,12 @@ static void odd_polygons(void)
     scene = warned("v 0 0 0\nv 1 1 0\nv 1 nan 0\nv 0 1e39 0\nf 1 2 3 4\n", NULL,
                    "obj:3: a vertex is not finite: its triangles are never hit");
     CHECK(scene.triangle_count == 2, "%d triangles", (int)scene.triangle_count);
+    metro_scene_free(&scene);
+    scene = warned("v 0 0 -1.#IND00\nv 1.#INF 1 0\nv 1 -1.#QNAN 0\nv 0 1e10000 -1e-10000\nf 1 2 3 4\n", NULL,
+                   "obj:1: a vertex is not finite: its triangles are never hit");
+    CHECK(!isfinite(scene.corner[2]) && !isfinite(scene.corner[3]) && !isfinite(scene.corner[7]), "-1.#IND is read");
+    CHECK(isinf(scene.corner[16]) && scene.corner[17] == 0, "1e10000 is %g, -1e-10000 %g", (double)scene.corner[16],
+          (double)scene.corner[17]);
     metro_scene_free(&scene);
     scene =
         good("v 0 0 0\nv 3e38 0 0\nv 1e38 1e38 0\nv 0 3e38 0\nv -3e38 -3e38 0\nf 4 1 2 3\nf 1 2 3 4 5\n", NULL, 5, 0);
@@ -1088,6 +1108,9 @@ static void write_text(const char *name, const char *text)
     fclose(file);
 }
 
+#define CANNOT_READ(line)                                                                                            \
+    "%s/room.obj:" line ": the MTL file cannot be read (put it beside the OBJ, or correct mtllib): "
+
 /* Loads `text` as room.obj of the folder, which must give `message` (%s: the folder) and so many materials. */
 static void loads(const char *text, const char *message, size_t materials)
 {
@@ -1150,15 +1173,19 @@ static void libraries(void)
         loads(text, "", 1);
     }
     loads("\n\nmtllib none.mtl\nmtllib nor this.mtl\n" USE_A,
-          "%s/room.obj:3: the MTL file cannot be read: none.mtl\n"
+          CANNOT_READ("3") "none.mtl\n"
           "%s/room.obj:6: no MTL file defines the material a; it is drawn with Kd 0.5",
           0);
-    loads("mtllib none.mtl a.mtl\n" USE_A, "", 1);
-    loads("mtllib sub\nmtllib a.mtl\n" USE_A, "%s/room.obj:1: the MTL file cannot be read: sub", 1);
-    loads("mtllib /dev/zero\nmtllib a.mtl\n" USE_A, "%s/room.obj:1: the MTL file cannot be read: /dev/zero", 1);
+    loads("mtllib none.mtl a.mtl\n" USE_A, CANNOT_READ("1") "none.mtl", 1);
+    loads("mtllib a.mtl none.MTL\n" USE_A, CANNOT_READ("1") "none.MTL", 1);
+    loads("mtllib none a.mtl\n" USE_A, "", 1);
+    loads("mtllib /nowhere/a.mtl C:\\nowhere\\b.mtl\n" USE_A "usemtl b\nf 1 1 1\n", "", 2);
+    loads("mtllib C:\\Users\\me\\my room.mtl\n" USE_A, "", 1);
+    loads("mtllib sub\nmtllib a.mtl\n" USE_A, CANNOT_READ("1") "sub", 1);
+    loads("mtllib /dev/zero\nmtllib a.mtl\n" USE_A, CANNOT_READ("1") "/dev/zero", 1);
     loads("mtllib\nmtllib \n" "v 0 0 0\nf 1 1 1\n", "", 0);
     if (mkfifo(in_folder("pipe.mtl"), 0600) == 0) {
-        loads("mtllib pipe.mtl\nmtllib a.mtl\n" USE_A, "%s/room.obj:1: the MTL file cannot be read: pipe.mtl", 1);
+        loads("mtllib pipe.mtl\nmtllib a.mtl\n" USE_A, CANNOT_READ("1") "pipe.mtl", 1);
         remove(in_folder("pipe.mtl"));
     }
 }
@@ -1186,8 +1213,9 @@ static void files_that_fail(void)
     write_text("bad.obj", "v 0 0\n");
     write_text("worse.obj", "mtllib bad.mtl\n" USE_A);
     write_text("empty.obj", "");
-    fails("bad.obj", METRO_ERROR_FORMAT, "%s/bad.obj:1: a vertex (v) needs three numbers");
-    fails("worse.obj", METRO_ERROR_FORMAT, "%s/bad.mtl:3: Kd, Ks and Ke need one or three numbers, and Ns needs one");
+    fails("bad.obj", METRO_ERROR_FORMAT, "%s/bad.obj:1: a vertex (v) needs three numbers such as 0.5 -1 2e-3");
+    fails("worse.obj", METRO_ERROR_FORMAT,
+          "%s/bad.mtl:3: Kd, Ks and Ke need one or three finite numbers, and Ns needs one");
     fails("empty.obj", METRO_ERROR_FORMAT, "%s/empty.obj: there is no face (f) in the file; is it an OBJ file?");
     fails("none.obj", METRO_ERROR_FILE,
           "%s/none.obj: the file cannot be opened; check that it exists and that you may read it");

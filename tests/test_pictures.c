@@ -178,8 +178,10 @@ static void reads_ppm(void)
     expect_values("P6", BYTES("P6\n2 2\n255\n\xff\0\0\0\xff\0\0\0\xff\x80\xbc\xff"), 2, 2, 3, corner);
     expect_values("P6, comments", BYTES("P6 # a\n#b 9 9\n 2\t\t2 #\n\r\n255\n\xff\0\0\0\xff\0\0\0\xff\x80\xbc\xff"),
                   2, 2, 3, corner);
-    expect_values("P6, white space behind", BYTES("P6 2 2 255 \xff\0\0\0\xff\0\0\0\xff\x80\xbc\xff\n \r\n"),
-                  2, 2, 3, corner);
+    expect_values("P6, a line end behind", BYTES("P6 2 2 255 \xff\0\0\0\xff\0\0\0\xff\x80\xbc\xff\n"), 2, 2, 3,
+                  corner);
+    expect_values("P3, white space behind", BYTES("P3 2 2 255 255 0 0 0 255 0 0 0 255 128 188 255\n \r\n"), 2, 2, 3,
+                  corner);
     expect_values("P3", BYTES("P3 2 2 255 255 0 0 0 255 0 0 0 255 128 188 255"), 2, 2, 3, corner);
     expect_values("P3, comments",
                   BYTES("P3\n2 2\n255\n255 0 0 # red\n0 255 0#green\n\n#\n0 0\t255\n0128 188 255\n# end"),
@@ -326,6 +328,9 @@ static void refuses(void)
         { BYTES("P3 1 1 255 0\0 0 0 0"), "whole number" },
         { BYTES("P3 1 1 255 0 0 0 0"), "after its last pixel" },
         { BYTES("P3 1 1 255 0 0 0 x"), "after its last pixel" },
+        { BYTES("P6 1 1 255\nABC "), "after its last pixel" },
+        { BYTES("P6\r\n1 1\r\n255\r\nAB\t"), "after its last pixel" },
+        { BYTES("P6 1 1 255\nABC\n\n"), "after its last pixel" },
         { BYTES("PF 1 1"), "scale" },
         { BYTES("PF 1 1 \0\0\0\0\0\0\0\0\0\0\0\0"), "scale" },
         { BYTES("PF 1 1 0\n\0\0\0\0\0\0\0\0\0\0\0\0"), "scale" },
@@ -640,7 +645,8 @@ static void devices(void)
 {
 #ifndef _WIN32
     metro_image image = random_picture(3, 2, 3), read = nothing();
-    char path[300];
+    char path[300], link[40];
+    FILE *file;
     snprintf(path, sizeof path, "%s", scratch("device"));
     if (link_to("/dev/full", path)) {
         CHECK(metro_image_save_pfm(&image, path) == METRO_ERROR_FILE, "a full device was not noticed");
@@ -652,6 +658,19 @@ static void devices(void)
         CHECK(metro_image_load(path, &read, NULL, 0) == METRO_ERROR_FORMAT, "/dev/null is an empty file");
     }
     remove(path);
+    /* What stands in /dev may be a link to an ordinary file, as /dev/stdout is behind a `>`. */
+    snprintf(path, sizeof path, "%s", scratch("redirected.pfm"));
+    file = fopen(path, "wb");
+    if (file != NULL) {
+        snprintf(link, sizeof link, "/dev/fd/%d", fileno(file));
+        if (exists(link)) {
+            CHECK(metro_image_save_pfm(&image, link) == METRO_OK, "cannot write %s", link);
+            CHECK(metro_image_load(path, &read, NULL, 0) == METRO_OK && read.width == 3, "%s did not get it", path);
+        }
+        fclose(file);
+    }
+    remove(path);
+    metro_image_free(&read);
     metro_image_free(&image);
 #endif
 }
