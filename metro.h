@@ -1320,14 +1320,16 @@ typedef enum {
 typedef enum {
     METRO_POWER,      /* the power heuristic, eq 12.3 */
     METRO_BALANCE,    /* the balance heuristic */
-    METRO_UNWEIGHTED  /* each way counts the whole path: pictures of single ways, which must agree */
+    METRO_UNWEIGHTED  /* each way counts the whole path: pictures of single ways, which must agree, and no sum */
 } metro_heuristic;
 
 /* Where the chains of a render start. */
 typedef enum {
     METRO_START_SEEDS,    /* at one of `candidates` uniform draws, in proportion to its importance */
-    METRO_START_POINT,    /* at the first state of positive importance of stream `start_seed`: the same in each run */
-    METRO_START_WEIGHTED  /* as METRO_START_SEEDS, with Veach's weights: unbiased from the first sample */
+    METRO_START_POINT,    /* at the first uniform draw that is not dark: another for each chain, but the same in each
+                             run and part */
+    METRO_START_WEIGHTED  /* as METRO_START_SEEDS, with Veach's weights: unbiased from the first sample. A run that
+                             returns METRO_ERROR_NO_IMPORTANCE belongs to the mean, as a black picture */
 } metro_start;
 
 /* Zero means the default, which stands behind the colon. */
@@ -1344,7 +1346,7 @@ typedef struct {
     uint64_t part;              /* the number of this share of a larger run: shares are independent */
     size_t threads;             /* one for each core */
     /* for METRO_MLT and METRO_PSSMLT: */
-    size_t chains;              /* 64 */
+    size_t chains;              /* at most 4096: 64 */
     metro_start start;
     size_t candidates;          /* for each chain: 1024 */
     uint64_t start_seed;        /* for METRO_START_POINT */
@@ -1361,35 +1363,39 @@ typedef struct {
     const metro_scene *scene;
     metro_render_options options; /* with the defaults filled in */
     uint64_t rounds;              /* done so far */
-    uint64_t samples, rays;
+    uint64_t samples, rays;       /* of the rounds; pilots and starts of chains are not counted */
     void *state;
 } metro_render;
 
 /* What a careful person asks of a picture. NaN stands for what a method does not have. */
 typedef struct {
-    double mean, mean_error;       /* the mean luminance of the picture and its standard error */
+    double mean, mean_error;       /* the mean luminance of the picture and its standard error. Even points (see
+                                      random_numbers) are better than their error says */
     double b, b_error;             /* the integral of the importance, and its standard error */
     double acceptance;             /* the share of mutations that were accepted */
     double dark;                   /* the share of tentative states of zero importance */
     double squared_jump;           /* the mean squared distance of a mutation that is made, 0 for one that is not */
     uint64_t longest_stay;         /* the most mutations in a row that stayed in one state */
     uint64_t not_finite;           /* contributions that were NaN or infinite: counted, and left out */
-    double rhat;                   /* the worst R-hat of 16 blocks of the picture, over the chains */
-    double ess;                    /* the smallest bulk ESS of these blocks */
-    double worst;                  /* the largest relative standard error of these blocks */
+    double rhat;                   /* the worst R-hat over the chains, of sixteenths of the picture and the whole */
+    double ess;                    /* the smallest bulk ESS of these */
+    double worst;                  /* the largest relative standard error of a sixteenth */
     char warning[400];             /* why the picture is not to be trusted, in words; empty if nothing is known */
 } metro_render_report;
 
 /* Prepares to render `scene` as `camera` sees it; both are read during the runs and must stay. Returns
    METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses or options out of
-   range, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `render` is then unchanged. */
+   range (NULL: all defaults), METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `render` is then
+   unchanged. Cost: METRO_PSSMLT traces two rounds of METRO_BDPT for its pilot. Memory: 24 bytes a pixel, 8 bytes for
+   each chain (or 16) and block of 8 x 8 pixels, and with a pyramid of depth K 24 (K + 1)(K + 2) bytes a pixel. */
 METRO_API metro_result metro_render_make(const metro_scene *scene, const metro_camera *camera,
                                          const metro_render_options *options, metro_render *render);
 
 /* Makes `rounds` more rounds. After each, `stop` (may be NULL) is asked; nonzero ends the run with
    METRO_ERROR_STOPPED. Returns METRO_ERROR_NO_IMPORTANCE if no chain finds a state to start from, or
-   METRO_ERROR_MEMORY; what is there so far stands. The picture depends on the options and the number of rounds, not
-   on the threads or on how the rounds were shared out over calls. */
+   METRO_ERROR_MEMORY; what is there so far stands. With chains the first round begins with `candidates` draws for
+   each, up to 64 times as many where they are dark, and does not ask `stop` meanwhile. The picture depends on the
+   options and the number of rounds, not on the threads or on how the rounds were shared out over calls. */
 METRO_API metro_result metro_render_run(metro_render *render, uint64_t rounds,
                                         int (*stop)(const metro_render *render, void *user), void *user);
 
@@ -1397,15 +1403,17 @@ METRO_API metro_result metro_render_run(metro_render *render, uint64_t rounds,
    METRO_ERROR_ARGUMENT before the first round; `image` is then unchanged. */
 METRO_API metro_result metro_render_image(const metro_render *render, metro_image *image);
 
-/* The same for the paths of s vertices from the lamp and t from the eye, where the options ask for a pyramid. */
+/* The same for the paths of s vertices from the lamp and t from the eye. METRO_ERROR_ARGUMENT also where the options
+   ask for no pyramid, or there are no such paths: s >= 0, t >= 1 and 2 <= s + t <= depth + 1. */
 METRO_API metro_result metro_render_way(const metro_render *render, int s, int t, metro_image *image);
 
-/* The mean luminance of block (column, row) of 8 x 8 pixels and its standard error: from the spread over the chains,
-   or over sixteen groups of rounds. NaN where there is no such block or too little to say. */
+/* The mean luminance of block (column, row) of 8 x 8 pixels and its standard error, which may not be NULL: from the
+   spread over the chains, or over sixteen groups of rounds. NaN where there is no such block or too little to say.
+   Cost: all blocks times the chains. */
 METRO_API double metro_render_block(const metro_render *render, size_t column, size_t row, double *error);
 
-/* Says how far the picture so far can be believed. Never fails: before the first round all is NaN or 0. Cost: some
-   milliseconds for the ranks of R-hat. */
+/* Says how far the picture so far can be believed. Never fails: before the first round all is NaN or 0. One render is
+   for one thread at a time, also here. Cost: half a millisecond a chain for the ranks of R-hat. */
 METRO_API void metro_render_diagnose(const metro_render *render, metro_render_report *report);
 
 /* Gives back all memory; a zeroed render is allowed. */
@@ -12764,8 +12772,11 @@ typedef struct {
     size_t count;
     uint64_t rays;
     double importance;     /* of the state it belongs to, in a chain */
-    metroi_splat splat[1]; /* really as many as metroi_sample_room says */
 } metroi_sample;
+
+/* Behind a sample are as many splats as metroi_sample_room says, and behind a log (12.7) as many entries as its slot
+   has room for. */
+#define METROI_BEHIND(type, block) ((type *)((block) + 1))
 
 static size_t metroi_sample_room(const metroi_tracer *tracer)
 {
@@ -12788,15 +12799,16 @@ static double metroi_color_luminance(metro_vec3 color)
     return metro_luminance(color.x, color.y, color.z);
 }
 
+/* A NaN is not black, so that it is counted in the end. */
 static int metroi_color_black(metro_vec3 color)
 {
-    return !(color.x > 0 || color.y > 0 || color.z > 0);
+    return color.x <= 0 && color.y <= 0 && color.z <= 0;
 }
 
 static void metroi_sample_add(metroi_sample *sample, const metroi_tracer *tracer, uint32_t pixel, int s, int t,
                               metro_vec3 color)
 {
-    metroi_splat *splat = sample->splat, *end = splat + sample->count;
+    metroi_splat *splat = METROI_BEHIND(metroi_splat, sample), *end = splat + sample->count;
     if (metroi_color_black(color)) return;
     if (!tracer->separate)
         for (; splat < end; splat++)
@@ -13115,9 +13127,9 @@ static int metroi_join_eye(const metroi_tracer *tracer, metroi_sample *sample, c
 
    which is a density of the eye's first vertex n times as high. With n = 4 the same error takes three fifths of the
    time in the Cornell box and four fifths with the hidden lamp; between mirrors, whose light on the walls only the
-   ways to the film find, it takes as long as with n = 1. What pixels have in common does tell on the mean of a
-   picture, so its error comes from whole groups of pixels that share a walk. A state of a chain has a walk from
-   each side, and n = 1.
+   ways to the film find, it takes as long as with n = 1. Pixels that share a walk err together. No pixel shows it,
+   but the mean of the picture does, so its error is computed from groups of pixels that share a walk. A state of a
+   chain has a walk from each side, and n = 1.
 
    [figure: fig3.svg | A path of two walks and the step that joins them, drawn in its scene (figure 3 of the paper).]
 
@@ -13221,7 +13233,6 @@ typedef struct {
     uint64_t samples, groups, rays, not_finite;
     double luminance, luminance2;  /* of all that a group of samples contributes: the sums of it and of its square */
     size_t count;
-    metroi_log_entry entry[1];     /* really as many as the slot has room for */
 } metroi_log;
 
 static size_t metroi_log_size(size_t entries)
@@ -13232,7 +13243,7 @@ static size_t metroi_log_size(size_t entries)
 /* Returns the luminance that is added: 0 for what is not finite, or not as a float. */
 static double metroi_log_add(metroi_log *log, const metroi_splat *splat, double weight)
 {
-    metroi_log_entry *entry = &log->entry[log->count];
+    metroi_log_entry *entry = METROI_BEHIND(metroi_log_entry, log) + log->count;
     metro_vec3 color = metro_scale(splat->color, weight);
     entry->color[0] = metroi_float(color.x);
     entry->color[1] = metroi_float(color.y);
@@ -13307,8 +13318,8 @@ static metro_result metroi_canvas_make(size_t width, size_t height, size_t batch
 /* The relative error of the luminance of all that was added, from the spread over the groups of samples. */
 static double metroi_canvas_error(const metroi_canvas *canvas)
 {
-    double n = (double)canvas->groups, mean = canvas->luminance / n;
-    return sqrt((canvas->luminance2 / n - mean * mean) / (n - 1)) / mean;
+    double n = (double)canvas->groups, mean = canvas->luminance / n, variance = canvas->luminance2 / n - mean * mean;
+    return sqrt((variance < 0 ? 0 : variance) / (n - 1)) / mean; /* rounding may leave less than 0 */
 }
 
 static void metroi_canvas_add(metroi_canvas *canvas, const metroi_log *log, size_t batch)
@@ -13316,7 +13327,7 @@ static void metroi_canvas_add(metroi_canvas *canvas, const metroi_log *log, size
     size_t i, c, pixels = canvas->width * canvas->height;
     double *block = canvas->block + batch * canvas->columns * canvas->rows;
     for (i = 0; i < log->count; i++) {
-        const metroi_log_entry *entry = &log->entry[i];
+        const metroi_log_entry *entry = METROI_BEHIND(const metroi_log_entry, log) + i;
         size_t x = entry->pixel % canvas->width, y = entry->pixel / canvas->width;
         for (c = 0; c < 3; c++) canvas->sum[3 * entry->pixel + c] += (double)entry->color[c];
         block[y / 8 * canvas->columns + x / 8] += metro_luminance((double)entry->color[0], (double)entry->color[1],
@@ -13350,6 +13361,7 @@ typedef struct {
     unsigned even_pairs;
     size_t threads;
     size_t jobs;           /* in a round, rounded up to whole groups */
+    size_t log_size;       /* in bytes; a sample stands behind the log in a slot, so that no job lacks memory */
     /* called with each log before it is added; may be NULL */
     void (*look)(const metroi_log *log, void *user);
     void *user;
@@ -13393,16 +13405,16 @@ static metro_result metroi_path_work(uint64_t job, void *slot, void *user)
     size_t left = first < all ? all - first : 0, pixels = left < METROI_JOB_PIXELS ? left : (size_t)METROI_JOB_PIXELS;
     size_t members = (size_t)plan->tracer.eye_walks, groups = pixels / members, group, k, i;
     metro_rng rng = metro_rng_make(plan->key, job);
-    metroi_sample *sample = (metroi_sample *)METRO_MALLOC(metroi_sample_size(&plan->tracer));
+    metroi_sample *sample = (metroi_sample *)((unsigned char *)slot + plan->log_size);
     metroi_walks walks;
-    if (sample == NULL) return METRO_ERROR_MEMORY;
     for (group = 0; group < groups + pixels % members; group++) {
         size_t serves = group < groups ? members : 1;
         double luminance = 0;
         for (k = 0; k < serves; k++) {
             size_t pixel = first + metroi_group_pixel(pixels, members, group, k);
             metroi_path_pixel(plan, &rng, pixel, job / plan->jobs, k == 0 ? (int)serves : 0, &walks, sample);
-            for (i = 0; i < sample->count; i++) luminance += metroi_log_add(log, &sample->splat[i], 1);
+            for (i = 0; i < sample->count; i++)
+                luminance += metroi_log_add(log, METROI_BEHIND(metroi_splat, sample) + i, 1);
             log->samples++;
             log->rays += sample->rays;
         }
@@ -13410,7 +13422,6 @@ static metro_result metroi_path_work(uint64_t job, void *slot, void *user)
         log->luminance += luminance;
         log->luminance2 += luminance * luminance;
     }
-    METRO_FREE(sample);
     return METRO_OK;
 }
 
@@ -13432,7 +13443,8 @@ static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
     rounds.jobs = METROI_ROUND_JOBS;
     rounds.rounds = plan->jobs / METROI_ROUND_JOBS;
     rounds.first_round = round * rounds.rounds;
-    rounds.slot_size = metroi_log_size(METROI_JOB_PIXELS * metroi_sample_room(&plan->tracer));
+    plan->log_size = metroi_log_size(METROI_JOB_PIXELS * metroi_sample_room(&plan->tracer));
+    rounds.slot_size = plan->log_size + metroi_sample_size(&plan->tracer);
     rounds.threads = plan->threads;
     rounds.work = metroi_path_work;
     rounds.merge = metroi_path_merge;
@@ -13443,20 +13455,21 @@ static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
 
    The paths of chapter 12 become states of the chain of chapter 4. The integrand is the picture, a vector with three
    numbers for each pixel; a path contributes to one pixel, or, when several of its ways reach the film, to a few. The
-   importance of a path is one number, the luminance of all that it contributes, and then (eq 4.1) each sample adds
-   b f/I to the picture: of luminance b, wherever it falls. What a chain does not know is b; and, like any chain, it
-   remembers its start. */
+   importance of a path is one number, as a rule the luminance of all that it contributes, and then (eq 4.1) each
+   sample adds b f/I to the picture: of luminance b, wherever it falls. What a chain does not know is b; and, like any
+   chain, it remembers its start. */
 
 /* # 13.1 The paper's state
 
    A state is a position on the film, a point on a lamp, and the directions of both walks: points of the unit square,
    of the unit square and of the sphere, in the frame of the world. Each is measured so that its total is 1, a
    direction by d omega/(4 pi). With K edges at most there are K - 1 directions for the walk from the eye and K - 1
-   for the walk from the lamp; a path that ends early, in a lamp or because a direction points into a surface, does
-   not use the rest, and they stay in the state for the next one.
+   for the walk from the lamp; a path that ends early, at a surface that reflects nothing or because a direction
+   points into a surface, does not use the rest, and they stay in the state for the next one.
 
    The integrand joins all points of both walks. For the weights of section 12.3 only the densities matter, and here
-   all directions are drawn with the density 1/(4 pi), whatever the surface: each step of eq 12.2 multiplies alpha by
+   all directions but the first from the eye, which is that of the film position, are drawn with the density 1/(4 pi),
+   whatever the surface: each step of eq 12.2 multiplies alpha by
 
        alpha_{i+1} = alpha_i 4 pi f cos(theta)                                        (13.1)
 
@@ -13466,13 +13479,14 @@ static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
 
    The mutation is an angular perturbation: a uniform direction of a cone about the old one, of all directions at once
    or of one of them. The paper's size is the apex angle, the full angle of the cone. The position on the film moves
-   by up to half the apex angle as well, as seen from the eye; the point of the lamp, which has no angle, moves by the
-   same share of its square as the cone has of a straight angle. Film and lamp are intervals with reflecting ends.
+   by up to half the apex angle as well, as seen from the eye, on average over the film; the point of the lamp, which
+   has no angle, moves by the same share of its square as the cone has of a straight angle. Film and lamp are
+   intervals with reflecting ends.
 
    The geometry of the paper's scenes was not published. The Cornell box stands in for its homogeneous scene, and a
-   room whose lamp shines from behind a door for the one with difficult lighting. Where a lamp is in the picture every
-   state can be joined to it, so no state is dark and most mutations are accepted, whatever the walks do: studies of
-   the bias leave out paths of one edge.
+   room whose lamp shines from behind a door for the one with difficult lighting. Where a whole lamp is in the picture
+   every state can be joined to it, so no state is dark and most mutations are accepted, whatever the walks do:
+   studies of the bias leave out paths of one edge.
 
    [figure: fig4.svg | The error against samples per pixel for apex angles from .05 to .6 rad, and the reference
    picture (figure 4 of the paper).]
@@ -13550,10 +13564,11 @@ static double metroi_sample_importance(metroi_walker *walker, metroi_sample *sam
     size_t i;
     walker->luminance = 0;
     for (i = 0; i < sample->count; i++) {
-        metro_vec3 color = sample->splat[i].color;
+        const metroi_splat *splat = METROI_BEHIND(metroi_splat, sample) + i;
+        metro_vec3 color = splat->color;
         double luminance = metroi_color_luminance(color), value = luminance;
         if (plan->options->largest_channel) value = metroi_largest_component(color);
-        if (plan->pilot != NULL) value /= plan->pilot[sample->splat[i].pixel]; /* eq 13.3 */
+        if (plan->pilot != NULL) value /= plan->pilot[splat->pixel]; /* eq 13.3 */
         walker->luminance += luminance;
         importance += value;
     }
@@ -13569,7 +13584,8 @@ static void metroi_sample_record(const void *kept, double weight, void *user)
     const metroi_sample *sample = (const metroi_sample *)kept;
     size_t i;
     weight *= walker->scale / sample->importance; /* eq 4.1 */
-    for (i = 0; walker->log != NULL && i < sample->count; i++) metroi_log_add(walker->log, &sample->splat[i], weight);
+    for (i = 0; walker->log != NULL && i < sample->count; i++)
+        metroi_log_add(walker->log, METROI_BEHIND(const metroi_splat, sample) + i, weight);
 }
 
 /* All ways of the walks that a state describes. */
@@ -13696,12 +13712,13 @@ static double metroi_way_importance(const double *z, void *kept, void *user)
     const metroi_tracer *tracer = &walker->plan->tracer;
     const metroi_way *way = metroi_way_choose(walker->plan, z[0]);
     metroi_sample *sample = (metroi_sample *)kept;
+    metroi_splat *splat = METROI_BEHIND(metroi_splat, sample);
     metroi_numbers numbers;
     memset(&numbers, 0, sizeof numbers);
     numbers.z = z + 1;
     metroi_trace_way(tracer, &numbers, metroi_film(z[1], tracer->camera.width),
                      metroi_film(z[2], tracer->camera.height), way->s, way->t, sample);
-    if (sample->count > 0) sample->splat[0].color = metro_scale(sample->splat[0].color, 1 / way->share); /* eq 13.2 */
+    if (sample->count > 0) splat->color = metro_scale(splat->color, 1 / way->share); /* eq 13.2 */
     return metroi_sample_importance(walker, sample);
 }
 
@@ -13710,9 +13727,10 @@ static double metroi_way_importance(const double *z, void *kept, void *user)
 
 static int metroi_way_uses(const metroi_way *way, size_t place)
 {
-    int bounce = (int)((place - 1) / 2);
+    int bounce;
     if (place == 0) return way->t >= 2;
     if (place <= 2) return way->s >= (int)place;
+    bounce = (int)((place - 1) / 2);
     return place % 2 == 1 ? bounce <= way->t - 2 : bounce <= way->s - 2;
 }
 
@@ -13734,14 +13752,15 @@ METROI_COLD
 /* # 13.3 A pilot picture
 
    A chain whose importance is the luminance spends its samples where the picture is bright, and the eye asks for the
-   same relative error everywhere. So we first trace a small picture by the methods of chapter 12, blur it, and divide
-   the importance by it (Veach 1997, chapter 11, calls this two stages): with the pilot's luminance $P_j$ in pixel
-   j, relative to its mean and not less than a tenth of it,
+   same relative error everywhere. So we first trace a picture in two rounds by the methods of chapter 12, blur it,
+   and divide the importance by it (Veach 1997, chapter 11, calls this two stages): with the pilot's luminance $P_j$
+   in pixel j, relative to its mean and not less than a tenth of it,
 
        I = sum_{j} frac{Y_j}{P_j}                                                     (13.3)
 
    Any P leaves the picture right, because eq 4.1 divides by I again; a good one makes it evenly noisy. The pilot
-   serves two more ends: its ways show which $q_{s,t}$ of eq 13.2 pay, and its mean is an estimate of b. */
+   serves two more ends: its ways show which $q_{s,t}$ of eq 13.2 pay, and its mean is an estimate of the mean
+   luminance. */
 
 static void metroi_blur_line(const double *from, double *to, size_t count, size_t stride)
 {
@@ -13792,9 +13811,8 @@ static void metroi_pilot_look(const metroi_log *log, void *user)
     metroi_pilot_ways *pilot = (metroi_pilot_ways *)user;
     size_t i;
     for (i = 0; i < log->count; i++) {
-        const metroi_log_entry *entry = &log->entry[i];
+        const metroi_log_entry *entry = METROI_BEHIND(const metroi_log_entry, log) + i;
         double value = metro_luminance((double)entry->color[0], (double)entry->color[1], (double)entry->color[2]);
-        if (pilot->plan->pilot != NULL) value /= pilot->plan->pilot[entry->pixel];
         pilot->share[metroi_way_index(pilot->plan->tracer.depth, entry->s, entry->t)] += value;
     }
 }
@@ -13838,6 +13856,7 @@ static metro_result metroi_pilot_rounds(metroi_metropolis *plan, metroi_path_pla
         result = metroi_path_round(paths, (uint64_t)round);
     plan->pilot_mean = canvas->luminance / (double)canvas->samples;
     plan->pilot_error = metroi_canvas_error(canvas) * plan->pilot_mean;
+    if (canvas->not_finite > 0) plan->pilot_error = 0; /* it left out what the chains do not: it says nothing */
     if (result == METRO_OK && plan->way != NULL) metroi_ways_choose(plan, pilot.share);
     if (result == METRO_OK && !options->one_stage) result = metroi_pilot_picture(plan, canvas);
     METRO_FREE(pilot.share);
@@ -13881,11 +13900,11 @@ static metro_result metroi_start_point(metro_chain *chain, double *z, uint64_t s
     metro_rng rng = metro_rng_make(seed, index);
     metro_result result = METRO_ERROR_DARK_SEED;
     size_t tries;
-    for (tries = 0; result == METRO_ERROR_DARK_SEED && tries < 64 * candidates; tries++) {
+    for (tries = 0; result != METRO_OK && tries / 64 < candidates; tries++) {
         metroi_state_draw(&chain->target, z, &rng);
-        result = metro_chain_start_point(chain, z);
+        result = metro_chain_start_point(chain, z); /* refuses a dark state, and one that is not finite */
     }
-    return result == METRO_ERROR_DARK_SEED ? METRO_ERROR_NO_IMPORTANCE : result;
+    return result == METRO_OK ? METRO_OK : METRO_ERROR_NO_IMPORTANCE;
 }
 
 static metro_result metroi_walker_start_point(metroi_walker *walker, uint64_t index)
@@ -13902,18 +13921,30 @@ static metro_result metroi_walker_start_point(metroi_walker *walker, uint64_t in
     return result;
 }
 
-/* A start from seeds takes up to 64 times as many candidates before it gives up. One from weighted seeds may not: the
-   estimate 0 belongs to the mean. */
+/* A start from seeds takes up to 64 times as many candidates before it gives up. Those after the first time do not
+   count for b, which would be too high if what one stops at counted. With weighted seeds a chain must not try again:
+   its estimate is 0, and leaving that out would raise the mean. */
+
+static metro_result metroi_start_again(metro_chain *chain, size_t candidates)
+{
+    metro_moments normalisation = chain->normalisation;
+    metro_result result = METRO_ERROR_NO_IMPORTANCE;
+    int tries;
+    for (tries = 1; result == METRO_ERROR_NO_IMPORTANCE && tries < 64; tries++)
+        result = metro_chain_start_weighted(chain, candidates);
+    chain->normalisation = normalisation;
+    return result;
+}
 
 static metro_result metroi_walker_start_seeds(metroi_walker *walker)
 {
     const metro_render_options *options = walker->plan->options;
-    int tries = options->start == METRO_START_SEEDS ? 64 : 1;
-    metro_result result = METRO_ERROR_NO_IMPORTANCE;
+    metro_result result;
     walker->independent = 1;
-    while (result == METRO_ERROR_NO_IMPORTANCE && tries-- > 0)
-        result = metro_chain_start_weighted(&walker->chain, options->candidates);
+    result = metro_chain_start_weighted(&walker->chain, options->candidates);
     walker->independent = 0;
+    if (result == METRO_ERROR_NO_IMPORTANCE && options->start == METRO_START_SEEDS)
+        result = metroi_start_again(&walker->chain, options->candidates);
     return result;
 }
 
@@ -13959,7 +13990,8 @@ static metro_result metroi_walk_work(uint64_t job, void *slot, void *user)
     for (i = 0; i < plan->group_steps; i++) {
         uint64_t large = chain->counts.large_steps;
         metro_chain_step(chain);
-        if (chain->counts.large_steps > large) metro_moments_add(&walker->brightness, walker->luminance);
+        if (chain->counts.large_steps > large)
+            metro_moments_add(&walker->brightness, isfinite(walker->luminance) ? walker->luminance : 0);
     }
     metro_chain_flush(chain);
     if (!(plan->options->large_step > 0)) { /* b has no other source: one draw for sixteen mutations */
@@ -13983,7 +14015,7 @@ static void metroi_trace_add(metroi_metropolis *plan, size_t chain, const metroi
     double scale = plan->walker[chain].scale > 0 ? plan->walker[chain].scale : 1; /* weights are no disagreement */
     size_t i;
     for (i = 0; i < log->count; i++) {
-        const metroi_log_entry *entry = &log->entry[i];
+        const metroi_log_entry *entry = METROI_BEHIND(const metroi_log_entry, log) + i;
         size_t x = entry->pixel % canvas->width * 4 / canvas->width;
         size_t y = entry->pixel / canvas->width * 4 / canvas->height;
         double value = metro_luminance((double)entry->color[0], (double)entry->color[1], (double)entry->color[2]);
@@ -14046,7 +14078,9 @@ static metro_result metroi_chains_round(metroi_metropolis *plan, uint64_t round)
     rounds.jobs = plan->options->chains;
     rounds.rounds = plan->groups;
     rounds.first_round = round * rounds.rounds;
-    rounds.slot_size = metroi_log_size(2 * (plan->group_steps + 1) * metroi_sample_room(&plan->tracer));
+    /* A step records one state at most, and the last is flushed; one way makes one splat. */
+    rounds.slot_size = metroi_log_size((plan->group_steps + 1) *
+                                       (plan->way != NULL ? 1 : metroi_sample_room(&plan->tracer)));
     rounds.threads = plan->options->threads;
     rounds.work = metroi_walk_work;
     rounds.merge = metroi_walk_merge;
@@ -14092,9 +14126,11 @@ METROI_COLD
 /* # 13.5 How bright
 
    b is the mean of the importance over independent states, and there is no end of them: the candidates of the starts,
-   and every large step of every chain, whose importance is known because the chain had to weigh it. So b is not
-   frozen when the chains start; it gets better as long as they run, and states its error. With a pilot the mean
-   luminance is estimated in the same way, and the pilot's own estimate joins in, weighted by its error. */
+   and every large step of every chain, whose importance is known because the chain had to weigh it; without large
+   steps, a draw for every sixteen mutations. So b is not frozen when the chains start; it gets better as long as they
+   run, and states its error. With a pilot the mean luminance is estimated in the same way, and the pilot's own
+   estimate joins in, weighted by its error. Where both are poor this lowers the mean, since a low estimate states a
+   low error as well. */
 
 static void metroi_moments_join(metro_moments *to, const metro_moments *from)
 {
@@ -14152,7 +14188,8 @@ static double metroi_chains_mean(const metroi_metropolis *plan, double *error)
     mean = metro_moments_mean(&luminance);
     *error = metro_moments_error(&luminance);
     if (plan->pilot_error > 0 && *error > 0) {
-        weight = *error * *error / (*error * *error + plan->pilot_error * plan->pilot_error);
+        weight = plan->pilot_error / *error;
+        weight = 1 / (1 + weight * weight);
         mean += weight * (plan->pilot_mean - mean);
         *error *= sqrt(1 - weight);
     }
@@ -14209,7 +14246,7 @@ static metro_result metroi_render_check(const metro_scene *scene, const metro_ca
     if (options->depth < 1 || options->depth > METRO_DEPTH_MOST) return METRO_ERROR_ARGUMENT;
     if (options->shortest < 1 || options->shortest > options->depth) return METRO_ERROR_ARGUMENT;
     if (!(options->large_step >= 0 && options->large_step <= 1)) return METRO_ERROR_ARGUMENT;
-    if (!(options->perturbation > 0 && isfinite(options->perturbation))) return METRO_ERROR_ARGUMENT;
+    if (!(options->perturbation > 1e-300 && isfinite(options->perturbation))) return METRO_ERROR_ARGUMENT;
     if (options->chains > METROI_LARGEST_CHAINS) return METRO_ERROR_ARGUMENT;
     if (!fits) return METRO_ERROR_ARGUMENT;
     return scene->light_count > 0 ? METRO_OK : METRO_ERROR_NO_LIGHT;
@@ -14317,8 +14354,6 @@ METRO_API metro_result metro_render_run(metro_render *render, uint64_t rounds,
     return METRO_OK;
 }
 
-/* What turns the sums of the canvas into radiance. */
-
 /* Chains: the picture gets the mean luminance that section 13.5 found. Where the importance is the luminance, this is
    eq 4.1 with the best b known. */
 
@@ -14331,6 +14366,7 @@ static double metroi_chains_scale(const metroi_metropolis *plan)
     return total > 0 ? pixels * metroi_chains_mean(plan, &error) / total : 0;
 }
 
+/* What turns the sums of the canvas into radiance. */
 static double metroi_render_scale(const metro_render *render)
 {
     const metroi_render *state = (const metroi_render *)render->state;
@@ -14493,12 +14529,15 @@ static double metroi_worst_window(const metro_render *render)
 
 static void metroi_chains_diagnose(const metroi_metropolis *plan, metro_render_report *report)
 {
-    size_t chains = plan->options->chains, block, c, draws = plan->trace_count, i;
+    size_t chains, block, c, draws = plan->trace_count, i;
     for (block = 0; draws >= 4 && block < METROI_TRACE_BLOCKS; block++) {
         double rhat, ess;
-        for (c = 0; c < chains; c++)
-            for (i = 0; i < draws; i++)
-                plan->draws[c * draws + i] = plan->trace[(c * METROI_TRACE_BLOCKS + block) * METROI_TRACE_DRAWS + i];
+        for (chains = c = 0; c < plan->options->chains; c++) {
+            const double *trace = plan->trace + (c * METROI_TRACE_BLOCKS + block) * METROI_TRACE_DRAWS;
+            if (!plan->walker[c].alive) continue; /* it has nothing to agree with */
+            for (i = 0; i < draws; i++) plan->draws[chains * draws + i] = trace[i];
+            chains++;
+        }
         rhat = metro_rhat(plan->draws, chains, draws);
         ess = metro_ess(plan->draws, chains, draws);
         if (!(report->rhat >= rhat) && !isnan(rhat)) report->rhat = rhat;
@@ -14546,6 +14585,8 @@ static void metroi_report_warn(const metro_render *render, metro_render_report *
     double share = report->mean_error / report->mean;
     char *text = report->warning;
     size_t room = sizeof report->warning;
+    int are_weighted = metroi_render_walks(&render->options) && render->options.start == METRO_START_WEIGHTED;
+    const char *cure = are_weighted ? "use more chains, or more candidates" : "run longer"; /* weights stay */
     if (report->not_finite > 0)
         snprintf(text, room,
                  "%.0f contributions were NaN or infinite and are missing in the picture: look for triangles or "
@@ -14577,10 +14618,10 @@ static void metroi_report_warn(const metro_render *render, metro_render_report *
     else if (isnan(share))
         snprintf(text, room, "there are too few samples to say how far the picture can be trusted: run longer");
     else if (!(share < 0.05))
-        snprintf(text, room, "the mean brightness is known to %d %% only: run longer", metroi_whole(100 * share));
+        snprintf(text, room, "the mean brightness is uncertain by %d %%: %s", metroi_whole(100 * share), cure);
     else if (report->worst > 0.25)
-        snprintf(text, room, "some part of the picture is known to %d %% only: run longer",
-                 metroi_whole(100 * report->worst));
+        snprintf(text, room, "some part of the picture is uncertain by %d %%: %s", metroi_whole(100 * report->worst),
+                 cure);
 }
 
 METRO_API void metro_render_diagnose(const metro_render *render, metro_render_report *report)
@@ -16086,15 +16127,15 @@ static metro_result metroi_walk_start(uint64_t job, void *slot, void *user)
     metroi_bundles *plan = (metroi_bundles *)user;
     metroi_batch *batch = &plan->batch[job];
     const metro_bundles_options *options = &plan->options;
-    int tries = options->start == METRO_START_WEIGHTED ? 1 : 64;
-    metro_result result = METRO_ERROR_NO_IMPORTANCE;
+    metro_result result;
     (void)slot;
     if (options->start == METRO_START_POINT) {
         metro_chain_survey(&batch->chain, options->candidates);
         result = metroi_start_point(&batch->chain, batch->state, options->start_seed, job, options->candidates);
     } else {
-        while (result == METRO_ERROR_NO_IMPORTANCE && tries-- > 0)
-            result = metro_chain_start_weighted(&batch->chain, options->candidates);
+        result = metro_chain_start_weighted(&batch->chain, options->candidates);
+        if (result == METRO_ERROR_NO_IMPORTANCE && options->start == METRO_START_SEEDS)
+            result = metroi_start_again(&batch->chain, options->candidates);
     }
     batch->alive = result == METRO_OK;
     batch->scale = options->start == METRO_START_WEIGHTED ? batch->chain.start_weight : 1;
@@ -16114,20 +16155,34 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
 /* # 14.11 The picture
 
    The last step is a final gathering: through each pixel go 6 x 6 rays, and each sees the radiance of the patch that
-   it meets. The share v_i of a patch in the picture is what the same rays find, so that no patch is seen whose light
-   a chain does not look for.
+   it meets. No two of them are in one column or one row of 36 x 36 cells of the pixel, so that even an edge along the
+   pixels is seen where it is to a 36th. In each pixel they are shifted by random numbers of its own, and what they
+   miss they miss on either side. The share v_i of a patch in the picture is what the same rays find, so that no patch
+   is seen whose light a chain does not look for.
 
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
 
 enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
 
-/* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
-   none. */
+/* The patch that ray number `ray` through pixel (x, y) sees from its front, and where it was hit; the number of
+   patches if there is none. `shift` holds the random numbers of the pixel. */
 
-static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y, metro_hit *hit)
+static void metroi_gather_shift(const metroi_bundles *plan, size_t x, size_t y, double shift[2])
 {
-    metro_vec3 direction = metroi_camera_direction(&plan->camera, x, y);
+    metro_rng rng = metro_rng_make(metroi_mix(plan->key + 2), y * plan->options.width + x);
+    shift[0] = metro_rng_uniform(&rng);
+    shift[1] = metro_rng_uniform(&rng);
+}
+
+static size_t metroi_gather_look(const metroi_bundles *plan, size_t x, size_t y, const double shift[2], int ray,
+                                 metro_hit *hit)
+{
+    const int side = METROI_GATHER_SIDE, column = ray % side, row = ray / side;
+    double u = (double)(column * side + row) / (side * side) + shift[0];
+    double v = (double)(row * side + column) / (side * side) + shift[1];
+    metro_vec3 direction = metroi_camera_direction(&plan->camera, (double)x + (u < 1 ? u : u - 1),
+                                                   (double)y + (v < 1 ? v : v - 1));
     if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, hit)
         || !(metro_dot(plan->facet[hit->triangle].normal, direction) < 0))
         return plan->patches.count;
@@ -16136,16 +16191,21 @@ static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
-    const size_t side = METROI_GATHER_SIDE, width = side * plan->options.width, height = side * plan->options.height;
+    const int rays = METROI_GATHER_SIDE * METROI_GATHER_SIDE;
     size_t x, y;
-    metro_hit hit;
-    for (y = 0; y < height; y++)
-        for (x = 0; x < width; x++) {
-            double px = ((double)x + 0.5) / (double)side, py = ((double)y + 0.5) / (double)side;
-            size_t patch = metroi_bundles_look(plan, px, py, &hit);
-            if (patch < plan->patches.count) share[patch] += 1;
+    int ray;
+    for (y = 0; y < plan->options.height; y++)
+        for (x = 0; x < plan->options.width; x++) {
+            double shift[2];
+            metroi_gather_shift(plan, x, y, shift);
+            for (ray = 0; ray < rays; ray++) {
+                metro_hit hit;
+                size_t patch = metroi_gather_look(plan, x, y, shift, ray, &hit);
+                if (patch < plan->patches.count) share[patch] += 1;
+            }
         }
-    for (x = 0; x < plan->patches.count; x++) share[x] /= (double)width * (double)height;
+    for (x = 0; x < plan->patches.count; x++)
+        share[x] /= (double)rays * (double)plan->options.width * (double)plan->options.height;
 }
 
 static void metroi_bundles_free(metroi_bundles *plan)
@@ -16506,21 +16566,21 @@ static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
 {
     const metroi_bundles *plan = gather->plan;
     double *pixel = gather->image->value + 3 * (y * gather->image->width + x);
-    const int side = METROI_GATHER_SIDE;
-    const double share = 1.0 / (side * side);
-    int i, j;
-    for (j = 0; j < side; j++)
-        for (i = 0; i < side; i++) {
-            metro_vec3 seen;
-            metro_hit hit;
-            size_t patch = metroi_bundles_look(plan, (double)x + (i + 0.5) / side, (double)y + (j + 0.5) / side,
-                                               &hit);
-            if (patch >= plan->patches.count) continue;
-            seen = metro_add(metroi_gather_at(gather, patch, &hit), metroi_surface_of(plan, hit.triangle)->emission);
-            pixel[0] += share * seen.x;
-            pixel[1] += share * seen.y;
-            pixel[2] += share * seen.z;
-        }
+    const int rays = METROI_GATHER_SIDE * METROI_GATHER_SIDE;
+    const double share = 1.0 / rays;
+    double shift[2];
+    int ray;
+    metroi_gather_shift(plan, x, y, shift);
+    for (ray = 0; ray < rays; ray++) {
+        metro_vec3 seen;
+        metro_hit hit;
+        size_t patch = metroi_gather_look(plan, x, y, shift, ray, &hit);
+        if (patch >= plan->patches.count) continue;
+        seen = metro_add(metroi_gather_at(gather, patch, &hit), metroi_surface_of(plan, hit.triangle)->emission);
+        pixel[0] += share * seen.x;
+        pixel[1] += share * seen.y;
+        pixel[2] += share * seen.z;
+    }
 }
 
 static metro_result metroi_gather_work(uint64_t job, void *slot, void *user)
@@ -16627,6 +16687,7 @@ METRO_API void metro_bundles_diagnose(const metro_bundles *bundles, metro_bundle
 METROI_WARM
 
 #undef METROI_NO_PATCH
+#undef METROI_BEHIND
 #undef METROI_INLINE
 #endif /* METRO_NO_TRACER */
 

@@ -823,10 +823,26 @@ static void say_run(const work *w)
                1e-6 * samples, 1e-6 * samples / w->seconds, 1e-6 * rays, 1e-6 * rays / w->seconds);
 }
 
+/* Does any of 32 x 32 rays from the eye meet the front of a triangle? */
+static int sees_a_front(const work *w)
+{
+    int i;
+    for (i = 0; i < 32 * 32; i++) {
+        metro_vec3 d = metro_camera_direction(&w->camera, w->image.width, w->image.height,
+                                              (i % 32 + 0.5) / 32 * (double)w->image.width,
+                                              (i / 32 + 0.5) / 32 * (double)w->image.height);
+        metro_hit hit;
+        if (metro_scene_hit(&w->scene, w->camera.eye, d, 0, (double)INFINITY, &hit) &&
+            metro_dot(metro_scene_normal(&w->scene, hit.triangle), d) < 0)
+            return 1;
+    }
+    return 0;
+}
+
 static void say_trust(const work *w)
 {
     const metro_render_report *p = &w->report;
-    printf("mean luminance %.5g +- %.2g\n", p->mean, p->mean_error);
+    printf("mean luminance %.5g +- %.2g\n", p->mean, isnan(p->mean_error) ? (double)NAN : p->mean_error);
     if (!isnan(p->acceptance)) {
         printf("b %.5g +- %.2g; %.1f %% of the mutations accepted, %.1f %% dark, longest stay %llu mutations\n", p->b,
                p->b_error, 100 * p->acceptance, 100 * p->dark, (unsigned long long)p->longest_stay);
@@ -841,9 +857,13 @@ static void say_trust(const work *w)
         if (w->noise > 0) printf(" (%.2g of noise in the reference subtracted)", w->noise);
         printf(", relative RMSE %.4g against %s\n", w->difference.relative_rmse, w->asked.answers[REFERENCE].text);
     }
-    if (p->warning[0] != 0) printf("warning: %s\n", p->warning);
-    if (w->framed && !(p->mean > 0))
+    if (sees_a_front(w)) {
+        if (p->warning[0] != 0) printf("warning: %s\n", p->warning);
+    } else if (w->framed)
         printf("warning: the camera stands outside of the scene, where a closed room shows only backs: give --eye\n");
+    else
+        printf("warning: the camera sees no surface from its front, and backs are black: move --eye into the room, or "
+               "turn the corners of the faces round\n");
 }
 
 static void say_files(const work *w)

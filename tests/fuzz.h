@@ -1,6 +1,6 @@
-/* fuzz.h - what the programs with LLVMFuzzerTestOneInput share: their demands, and a driver for where no fuzzer is. It
-   runs the files that it is given, or mutations of small good files, the same ones each time (METRO_TEST_SCALE shrinks
-   their number). Include it after metro.h and define FUZZ_NAME before it. */
+/* fuzz.h - what the programs with LLVMFuzzerTestOneInput share: their demands, and a driver for where no fuzzer is.
+   It runs the files that it is given, or mutations of small good files, the same ones each time (METRO_TEST_SCALE
+   shrinks their number). Include it after metro.h and define FUZZ_NAME before it. */
 
 #ifndef FUZZ_H
 #define FUZZ_H
@@ -42,8 +42,8 @@ static int fuzz_file(const char *path)
     return 0;
 }
 
-/* One small change: a byte, a bit, a digit, a piece taken out or doubled, seldom the end cut off, a word of the format
-   put in. */
+/* One small change: a byte, a bit, a digit, a piece taken out or doubled, seldom the end cut off, a word of the
+   format put in. */
 static size_t fuzz_mutate(uint8_t *bytes, size_t size, const char *word, metro_rng *rng)
 {
     size_t at = (size_t)metro_rng_below(rng, size + 1), length = (size_t)metro_rng_below(rng, size < 256 ? 9 : 33), i;

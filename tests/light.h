@@ -1,5 +1,5 @@
-/* light.h - what the tests of chapters 11 to 14 share: small scenes made in code, and a render in one call. Include it
-   after metro.h and check.h. */
+/* light.h - what the tests of chapters 11 to 14 share: small scenes made in code, and a render in one call. Include
+   it after metro.h and check.h. */
 
 #ifndef LIGHT_H
 #define LIGHT_H

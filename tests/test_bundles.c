@@ -1153,6 +1153,35 @@ static void failing_memory(void)
     metro_scene_free(&scene);
 }
 
+/* A square lamp that faces the eye covers a known part of the film, and its edges run along the pixels. Catches: rays
+   through a pixel in too few rows and columns. */
+static void edges_along_pixels(void)
+{
+    double squares = 0;
+    int i;
+    for (i = 0; i < 20; i++) {
+        double half = 0.5 + 0.037 * i, side = half / (4 * tan(20 * CHECK_PI / 180)), covered = 0, off;
+        metro_scene scene = empty_scene();
+        metro_camera camera = camera_make(metro_vec3_make(0, 0, 4), metro_vec3_make(0, 0, 0), 40);
+        metro_bundles_options options;
+        metro_bundles bundles;
+        size_t k;
+        memset(&options, 0, sizeof options);
+        options.width = options.height = 16;
+        options.seed = (uint64_t)i;
+        add_quad(&scene, metro_vec3_make(-half, -half, 0), metro_vec3_make(2 * half, 0, 0),
+                 metro_vec3_make(0, 2 * half, 0), add_material(&scene, grey(0), grey(0), 0, grey(1)));
+        build(&scene);
+        CHECK(metro_bundles_make(&scene, &camera, &options, &bundles) == METRO_OK, "make");
+        for (k = 0; k < bundles.patches.count; k++) covered += bundles.share[k];
+        off = covered / (side * side) - 1;
+        squares += off * off / 20;
+        metro_bundles_free(&bundles);
+        metro_scene_free(&scene);
+    }
+    CHECK(sqrt(squares) < 0.004, "the lamp covers its part of the film to %g only", sqrt(squares));
+}
+
 int main(void)
 {
     CHECK_RUN(patches_cover);
@@ -1177,5 +1206,6 @@ int main(void)
     CHECK_RUN(arguments);
     CHECK_RUN(dark);
     CHECK_RUN(failing_memory);
+    CHECK_RUN(edges_along_pixels);
     return check_done("bundles");
 }

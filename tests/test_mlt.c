@@ -35,6 +35,9 @@ static metro_camera hidden_camera(void)
     return camera_make(metro_vec3_make(-0.1, 1.2, 0.9), metro_vec3_make(-0.5, 0.8, -1), 75);
 }
 
+/* What stands behind a sample. */
+static const metroi_splat *splats(const metroi_sample *sample) { return (const metroi_splat *)(sample + 1); }
+
 /* ---- variants ---- */
 
 typedef struct {
@@ -156,10 +159,10 @@ static void importance_by_hand(void)
             state_draw(&render, z, &rng);
             importance = walker->chain.target.importance(z, sample, walker);
             for (k = 0; k < sample->count; k++) {
-                metro_vec3 c = sample->splat[k].color;
+                metro_vec3 c = splats(sample)[k].color;
                 double value = metro_luminance(c.x, c.y, c.z);
                 if (options.largest_channel) value = c.x > c.y ? (c.x > c.z ? c.x : c.z) : c.y > c.z ? c.y : c.z;
-                sum += plan->pilot != NULL ? value / plan->pilot[sample->splat[k].pixel] : value;
+                sum += plan->pilot != NULL ? value / plan->pilot[splats(sample)[k].pixel] : value;
             }
             CHECK(fabs(importance - sum) <= 1e-12 * sum, "%s: importance %.12g, should be %.12g", variant[v].name,
                   importance, sum);
@@ -201,7 +204,7 @@ static void ways_use_their_numbers(void)
             CHECK(metroi_way_choose(plan, z[0]) == way, "another way is chosen");
             before = walker->chain.target.importance(z, sample, walker);
             if (!(before > 0)) continue;
-            CHECK(sample->count == 1 && sample->splat[0].s == way->s && sample->splat[0].t == way->t,
+            CHECK(sample->count == 1 && splats(sample)[0].s == way->s && splats(sample)[0].t == way->t,
                   "another way is made");
             for (place = 0; place < 2 * DEPTH; place++) {
                 memcpy(keep, z + 1 + 2 * place, sizeof keep);
@@ -539,6 +542,83 @@ static void start_up_bias(void)
     short_runs(METRO_START_POINT, 32, 16, 100, &truth, &worst);
     CHECK(worst > 1.3 * bound, "fixed starts are off by %.2f standard errors only", worst);
     metro_render_free(&truth);
+    metro_scene_free(&scene);
+}
+
+/* Chains that found no start are no disagreement. Catches: R-hat of lines of zeros. */
+static void dead_chains(void)
+{
+    metro_scene scene = load_scene("S1");
+    metro_render_options options = options_make(METRO_PSSMLT, 16, 4);
+    metro_render_report report;
+    metro_render render;
+    size_t c, alive = 0;
+    options.chains = 16;
+    options.candidates = 1;
+    options.start = METRO_START_WEIGHTED;
+    render = render_run(&scene, &scene.camera, &options, 600);
+    for (c = 0; c < 16; c++) alive += plan_of(&render)->walker[c].alive ? 1u : 0u;
+    metro_render_diagnose(&render, &report);
+    CHECK(alive > 4 && alive < 16, "%d of 16 chains are alive", (int)alive);
+    CHECK(report.rhat < 1.1, "R-hat %g", report.rhat);
+    metro_render_free(&render);
+    metro_scene_free(&scene);
+}
+
+/* b from seeds that are drawn again while all are dark: over many runs it is the mean luminance, which bidirectional
+   paths know. Catches: draws that one stops at among those that count. */
+static void b_of_dark_starts(void)
+{
+    metro_scene scene = load_scene("S2");
+    metro_render truth = bidirectional(&scene, &scene.camera, 4, 8, 20000);
+    metro_render_options options = options_make(METRO_PSSMLT, 4, 8);
+    metro_render_report report, known;
+    metro_moments b = { 0, 0, 0, 0 };
+    uint64_t run, runs = check_count(20000, 1000);
+    metro_render_diagnose(&truth, &known);
+    options.chains = 1;
+    options.candidates = 4;
+    options.all_connections = options.one_stage = 1;
+    options.large_step = -1;
+    for (run = 0; run < runs; run++) {
+        metro_render render;
+        options.seed = run;
+        render = render_run(&scene, &scene.camera, &options, 1);
+        metro_render_diagnose(&render, &report);
+        metro_moments_add(&b, report.b);
+        metro_render_free(&render);
+    }
+    CHECK_SIGMA(metro_moments_mean(&b), known.mean, hypot(metro_moments_error(&b), known.mean_error));
+    metro_render_free(&truth);
+    metro_scene_free(&scene);
+}
+
+/* A lamp so bright that the importance of some states is infinite: they are counted and left out, of b and of the
+   mean as well. */
+static void infinite_states(void)
+{
+    metro_scene scene = empty_scene();
+    metro_camera camera = camera_make(metro_vec3_make(0, 1, 4), metro_vec3_make(0, 0, 0), 40);
+    metro_render_options options = options_make(METRO_PSSMLT, 16, 3);
+    static const metro_start start[3] = { METRO_START_SEEDS, METRO_START_POINT, METRO_START_WEIGHTED };
+    int i;
+    add_quad(&scene, metro_vec3_make(-1, 0, 1), metro_vec3_make(2, 0, 0), metro_vec3_make(0, 0, -2),
+             add_material(&scene, grey(0.5), grey(0), 0, grey(1)));
+    add_quad(&scene, metro_vec3_make(-0.2, 0.5, 0), metro_vec3_make(0, 0, 0.4), metro_vec3_make(0.4, 0, 0),
+             add_material(&scene, grey(0), grey(0), 0, grey(1.7e308)));
+    build(&scene);
+    for (i = 0; i < 3; i++) {
+        metro_render_report report;
+        metro_render render;
+        options.start = start[i];
+        options.heuristic = METRO_UNWEIGHTED;
+        options.one_stage = 1;
+        render = render_run(&scene, &camera, &options, 20);
+        metro_render_diagnose(&render, &report);
+        CHECK(!isnan(report.mean) && report.not_finite > 0, "start %d: mean %g, %d not finite", i, report.mean,
+              (int)report.not_finite);
+        metro_render_free(&render);
+    }
     metro_scene_free(&scene);
 }
 
@@ -935,6 +1015,9 @@ int main(void)
     CHECK_RUN(furnaces);
     CHECK_RUN(start_points);
     CHECK_RUN(start_up_bias);
+    CHECK_RUN(dead_chains);
+    CHECK_RUN(b_of_dark_starts);
+    CHECK_RUN(infinite_states);
     CHECK_RUN(b_is_refined);
     CHECK_RUN(report_by_hand);
     CHECK_RUN(errors_in_common);

@@ -724,6 +724,51 @@ static void beyond_floats(void)
     metro_scene_free(&scene);
 }
 
+/* A mirror so sharp that its lobe is beyond the range of doubles times a density of 0 is NaN: counted, and not taken
+   for black. */
+static void beyond_doubles(void)
+{
+    metro_scene scene = empty_scene();
+    metro_camera camera = camera_make(metro_vec3_make(0, 2, 2), metro_vec3_make(0, 0, 0), 30);
+    metro_render_options options = options_make(METRO_BDPT, 16, 3);
+    metro_render_report report;
+    metro_render render;
+    add_quad(&scene, metro_vec3_make(-1, 0, 1), metro_vec3_make(2, 0, 0), metro_vec3_make(0, 0, -2),
+             add_material(&scene, grey(0), grey(0.8), 1e194, grey(0)));
+    add_quad(&scene, metro_vec3_make(-2, 0, -2), metro_vec3_make(4, 0, 0), metro_vec3_make(0, 4, 0),
+             add_material(&scene, grey(0.5), grey(0), 0, grey(1)));
+    build(&scene);
+    render = render_run(&scene, &camera, &options, 8);
+    metro_render_diagnose(&render, &report);
+    CHECK(report.not_finite > 0 && strstr(report.warning, "NaN or infinite") != NULL, "%d counted, \"%s\"",
+          (int)report.not_finite, report.warning);
+    metro_render_free(&render);
+    metro_scene_free(&scene);
+}
+
+/* A lamp that fills the picture: all samples are alike, and the error is 0, whatever the sum of their squares rounds
+   to. */
+static void even_light(void)
+{
+    metro_camera camera = camera_make(metro_vec3_make(0, 0, 4), metro_vec3_make(0, 0, 0), 40);
+    int i;
+    for (i = 1; i <= 60; i++) {
+        metro_scene scene = empty_scene();
+        metro_render_options options = options_make(METRO_PATH, 16, 2);
+        metro_render_report report;
+        metro_render render;
+        add_quad(&scene, metro_vec3_make(-9, -9, 0), metro_vec3_make(18, 0, 0), metro_vec3_make(0, 18, 0),
+                 add_material(&scene, grey(0), grey(0), 1, grey(0.1 * i)));
+        build(&scene);
+        render = render_run(&scene, &camera, &options, 3);
+        metro_render_diagnose(&render, &report);
+        CHECK(report.mean_error < 1e-6 * report.mean && report.warning[0] == 0, "%g +- %g: %s", report.mean,
+              report.mean_error, report.warning);
+        metro_render_free(&render);
+        metro_scene_free(&scene);
+    }
+}
+
 static void references(void)
 {
     reference("S1", 0.16716, 4, 6.2);
@@ -1037,9 +1082,9 @@ static void allocations_fail(void)
     long before = allocations_live;
     int m;
     for (m = 0; m < 4; m++) {
-        metro_render_options options = options_make(method[m], 9, 3);
+        metro_render_options options = options_make(method[m], m == 0 ? 80 : 9, 3); /* 80: several groups of jobs */
         metro_render render;
-        metro_image image;
+        metro_image image, earlier;
         metro_result result = METRO_ERROR_MEMORY;
         long k;
         options.pyramid = 1;
@@ -1067,9 +1112,20 @@ static void allocations_fail(void)
         }
         CHECK(result == METRO_OK && k >= 2, "run, %ld allocations: %s", k, metro_result_text(result));
         CHECK(metro_render_run(&render, 2, NULL, NULL) == METRO_OK && render.rounds == 3, "run");
-        allocations_left = 0;
-        CHECK(metro_render_run(&render, 1, NULL, NULL) == METRO_ERROR_MEMORY && render.rounds == 3,
-              "no memory for a round");
+        earlier = render_image(&render);
+        result = METRO_ERROR_MEMORY;
+        for (k = 0; result != METRO_OK && k < 1000; k++) { /* a round that fails leaves no trace in the picture */
+            allocations_left = k;
+            result = metro_render_run(&render, 1, NULL, NULL);
+            allocations_left = -1;
+            if (result == METRO_OK) break;
+            CHECK(result == METRO_ERROR_MEMORY && render.rounds == 3, "no memory for a round");
+            image = render_image(&render);
+            CHECK(image_same(&image, &earlier), "allocation %ld of a round leaves a part of it", k);
+            metro_image_free(&image);
+        }
+        CHECK(k > 0, "a round needs no memory");
+        metro_image_free(&earlier);
         allocations_left = 0;
         CHECK(metro_render_image(&render, &image) == METRO_ERROR_MEMORY, "no memory for an image");
         allocations_left = -1;
@@ -1248,6 +1304,8 @@ int main(void)
     CHECK_RUN(groups_of_pixels);
     CHECK_RUN(sphere);
     CHECK_RUN(beyond_floats);
+    CHECK_RUN(beyond_doubles);
+    CHECK_RUN(even_light);
     CHECK_RUN(references);
     CHECK_RUN(exact_zeros_and_emission);
     CHECK_RUN(camera_on_a_lamp);

@@ -208,6 +208,8 @@ result "a PPM" $?
 result "a PNG" $?
 works "no camera" "$render" framed.obj $small --rounds 1 --out b.pfm
 says "the scene is framed" '^camera eye .* (chosen to frame the scene)$'
+works "a camera behind a wall" "$render" framed.obj $small --rounds 1 --eye 0,1,-60 --look 0,1,0 --out b.pfm
+says "only backs are seen" '^warning: the camera sees no surface from its front'
 works "a camera of one's own" "$render" framed.obj $small --rounds 4 --eye 0,1,3.9 --look 0,1,0 --fov 40 --out b.pfm
 same "the same camera, the same picture" a.pfm b.pfm
 works "upside down" "$render" room.obj $small --rounds 4 --up 0,-1,0 --out b.pfm
