@@ -521,7 +521,7 @@ typedef struct {
     size_t sample_size;      /* bytes that `importance` may write to `sample`; may be 0 */
     /* The importance I(z) >= 0 of the state z; whatever the target wants to record about z goes into `sample`. */
     double (*importance)(const double *z, void *sample, void *user);
-    /* Takes a sample with its weight; the weights of a step sum to 1. NULL: nothing is recorded. */
+    /* Takes a sample with its weight; the weights of a step sum to 1, and stays add up. NULL: nothing is recorded. */
     void (*record)(const void *sample, double weight, void *user);
     /* The tentative transition: writes the tentative state to `to` and returns T(to -> from) / T(from -> to). It need
        not stay in the space if the importance is 0 outside. NULL: each axis is perturbed by its kernel, which is
@@ -544,9 +544,10 @@ typedef struct {
     uint64_t stay;           /* the steps in a row up to this one */
     uint64_t large_steps;    /* tentative states that were uniform draws */
     uint64_t dark;           /* tentative states of zero importance */
-    uint64_t nan;            /* tentative states whose importance or transition ratio was NaN: rejected */
-    uint64_t negative;       /* ... or negative: rejected */
-    uint64_t infinite;       /* ... or infinite: rejected */
+    uint64_t nan;            /* importances and transition ratios that were NaN, of tentative states, which are then
+                                rejected, and of candidates and surveys, which then count as 0 */
+    uint64_t negative;       /* the same for negative */
+    uint64_t infinite;       /* and for infinite ones */
     metro_sum squared_jump;  /* sum of a(i -> t) times the squared distance from i to t (radians for directions) */
 } metro_chain_counts;
 
@@ -603,7 +604,7 @@ METRO_API metro_result metro_chain_start_weighted(metro_chain *chain, size_t can
 METRO_API void metro_chain_burn(metro_chain *chain, uint64_t steps);
 
 /* Makes one step and returns 1 if the tentative state was accepted, else 0. A sample is recorded when the chain
-   leaves it: call metro_chain_flush before reading the result. */
+   leaves it, with expected values also one that is rejected: call metro_chain_flush before reading the result. */
 METRO_API int metro_chain_step(metro_chain *chain);
 
 /* Makes `steps` steps and flushes. */
@@ -616,7 +617,9 @@ METRO_API void metro_chain_flush(metro_chain *chain);
 METRO_API void metro_chain_survey(metro_chain *chain, uint64_t samples);
 
 /* b, the integral of the importance: the mean over all independent draws of the chain so far (candidates, survey,
-   large steps). NaN if there were none. If `error` is not NULL it gets the standard error, NaN under two draws. */
+   large steps), of which NaN, negative and infinite ones count as 0. Unbiased if their number does not depend on
+   them: a start that finds all candidates dark is followed by no large steps, and then a survey of fixed size is
+   safer. NaN if there were none. If `error` is not NULL it gets the standard error, NaN under two draws. */
 METRO_API double metro_chain_b(const metro_chain *chain, double *error);
 
 /* # R5 Start-up theory
@@ -888,8 +891,9 @@ METRO_API metro_result metro_best_size(double (*importance)(double x, void *user
    length, and a burn-in is left out by the caller. For states on a circle hand over cos 2 pi x and sin 2 pi x, since
    the cut of the circle is no place of the space.
 
-   What cannot be said is NaN, and `metro_draws_trouble` says why. It is always NaN when a draw is not finite, when
-   all draws are equal, when there are no draws and when memory runs out. No function averages the chains before it
+   What cannot be said is NaN, and `metro_draws_trouble` says why (of all but metro_ess_tail). It is always NaN when a
+   draw is not finite, when all draws are equal (but for metro_squared_jump, which is 0), when there are no draws and
+   when memory runs out. No function averages the chains before it
    looks at them: the mean over chains that sit in different places looks like one chain that moves well. */
 
 /* The autocorrelation of one chain, rho[k] for the lags k = 0 .. lags - 1 (eq 7.3); rho[0] = 1. The estimate divides
@@ -907,7 +911,7 @@ METRO_API double metro_bernstein(const double *rho, size_t lags, uint64_t steps)
 /* The integrated autocorrelation time tau: so many draws are worth one independent draw, when their mean is what we
    want (eq 7.2). Estimated from all chains together by Geyer's initial monotone sequence (1992), on halves of chains
    as in Vehtari et al. (2021), so that metro_ess_mean times tau is the number of draws; never below 1 / log10 of that
-   number. Chains that disagree make it long. NaN under six draws a chain. Cost: n log n for n draws in all, up to 90
+   number. Chains that disagree make it long. NaN under six draws a chain. Cost: n log n for n draws in all, up to 100
    bytes a draw. */
 METRO_API double metro_autocorrelation_time(const double *draw, size_t chains, size_t draws);
 
@@ -916,7 +920,8 @@ METRO_API double metro_autocorrelation_time(const double *draw, size_t chains, s
    effective sample sizes of the quantiles at .05 and .95; metro_ess_mean belongs to the plain mean of the draws. A
    middle draw of an odd number is left out. NaN under six draws a chain; the tail also when the quantile at .95 is
    the largest draw, since then no draw lies beyond it. An antithetic chain is worth more than its draws, at most
-   log10 of their number times as much. Cost as metro_autocorrelation_time, and a sort. Source: Vehtari, Gelman,
+   log10 of their number times as much; but where already the first pair of correlations is not positive, the rule
+   says half of them. Cost as metro_autocorrelation_time, and a sort. Source: Vehtari, Gelman,
    Simpson, Carpenter and Buerkner (2021); the same numbers as their R package posterior. */
 METRO_API double metro_ess(const double *draw, size_t chains, size_t draws);
 METRO_API double metro_ess_tail(const double *draw, size_t chains, size_t draws);
@@ -924,10 +929,11 @@ METRO_API double metro_ess_mean(const double *draw, size_t chains, size_t draws)
 
 /* R-hat, how much chains and their halves disagree: 1 when they look alike, and below 1.01 for results one trusts. It
    takes the larger of two values, on ranks of the draws (do the chains sit in the same place?) and on ranks of their
-   distances from the median (are they as wide?). +INFINITY when every chain stands still and not all at the same
-   place. NaN under four draws a chain, or when all draws are equally far from the median. It compares chains with
+   distances from the median (are they as wide?). +INFINITY when each half of each chain stands still, in its
+   place or in its distance from the median, and not all in the same. NaN under four draws a chain, or when all draws
+   (but a middle one of an odd number, which is left out) are equally far from the median. It compares chains with
    each other, never with the truth: where no chain has been, it knows nothing. Cost: three sorts. Source: Vehtari et
-   al. (2021), rank-normalised split R-hat; the same numbers as posterior, but where every chain stands still. */
+   al. (2021), rank-normalised split R-hat; the same numbers as posterior, but where all halves stand still. */
 METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws);
 
 /* The Monte Carlo standard error of the mean of all draws, and of their standard deviation: the deviation of the
@@ -945,7 +951,7 @@ METRO_API const char *metro_draws_trouble(const double *draw, size_t chains, siz
 
 /* The mean squared distance between a draw of one chain and the next (eq 7.12), stays included: on a circle of length
    `period`, or on the line when `period` is 0. NaN under two draws, for a draw that is not finite, and for a period
-   that is negative, infinite or NaN. */
+   that is negative, infinite or NaN. Distances whose squares are beyond a double are infinite or 0. */
 METRO_API double metro_squared_jump(const double *draw, size_t draws, double period);
 
 /* How wrong a method is, from repeats of the same run with other random numbers. All are means over the values. */
@@ -959,15 +965,16 @@ typedef struct {
    values (the samples of a picture, say) of the first run, then of the second; `truth` holds the true values. The
    errors are standard errors by the jackknife over runs, so that the values of one run may depend on each other;
    where there is no bias, `bias2_error` is too large by sqrt(2 (repeats - 1)/(repeats - 2)). Of a few values only it
-   says little where their bias happens to be near 0: look at the signed bias then. Under two repeats bias^2 and
-   variance are NaN, under three so are their errors, and under two the error of the mean squared error. NaN or an
+   says little where their bias happens to be near 0: look at the signed bias then. One repeat gives
+   the mean squared error only, two add bias^2, variance and the error of the mean squared error, three give all; the
+   rest is NaN. NaN or an
    infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or a
    NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
    Source: Tukey (1958), Efron and Stein (1981). */
 METRO_API metro_result metro_repeats(const double *estimate, const double *truth, size_t repeats, size_t values,
                                      metro_bias_variance *out);
 
-/* The outcome of a check of detailed balance. `probability` is the chance that a transition in balance scores
+/* The outcome of a check of detailed balance. `probability` is about the chance that a transition in balance scores
    `chi_square` or more, times the number of coordinates, at most 1: under 1e-6 detailed balance is broken. A step may
    break it and yet leave the target as it is, as a rotation of a circle does; and what shows in no single coordinate
    is not seen. */
@@ -978,13 +985,15 @@ typedef struct {
     double excess;      /* the flow from -> to less the flow back, as a part of their sum, 0 .. 1 */
 } metro_balance;
 
-/* Tests a transition against the target that it should leave in balance (eq 7.15). `step` writes the state after
-   `from` to `to`; NULL means a step of metro_chain with the target's own proposal or kernels, which tests a proposal
-   and its ratio. `draws` uniform states are drawn, each is kept with the probability that its importance is of the
-   largest one, and steps once; each coordinate is cut into `cells` cells (2 to 256; 0 means 16; finer than the
-   perturbation is best). Returns METRO_ERROR_ARGUMENT, METRO_ERROR_MEMORY, or METRO_ERROR_NO_IMPORTANCE if no two
-   cells were connected by 20 pairs; then `balance` is untouched. Costs up to 3 importances and one step a draw; some
-   1e6 draws serve. Source: Bowker (1948) for the statistic, Wilson and Hilferty (1931) for its probability. */
+/* Tests a transition against the target that it should leave in balance (eq 7.15). `step`, which gets the target's
+   `user`, writes the state after `from` to `to`; NULL means a step of metro_chain with the target's own proposal or
+   kernels, which tests a proposal and its ratio. `draws` uniform states are drawn, each is kept with the probability
+   I/M, M being the largest of their importances, and steps once; where it steps to a brighter state than M it is left
+   out; each coordinate is cut into `cells` cells (2 to 256; 0 means 16; finer than the perturbation is best). Returns
+   METRO_ERROR_ARGUMENT (cells, a NULL, or a target that metro_chain_make refuses, also with a step of your own),
+   METRO_ERROR_MEMORY, or METRO_ERROR_NO_IMPORTANCE if no two cells were connected by 20 pairs; then `balance` is
+   untouched. Costs up to 4 importances and one step a draw; some 1e6 draws serve. Source: Bowker (1948) for the
+   statistic, Wilson and Hilferty (1931) for its probability. */
 METRO_API metro_result metro_balance_check(const metro_target *target,
                                            void (*step)(const double *from, double *to, metro_rng *rng, void *user),
                                            uint64_t draws, size_t cells, metro_rng rng, metro_balance *balance);
@@ -1010,10 +1019,10 @@ typedef struct {
    axis, from empirical Fourier coefficients (eq 7.17): no bins, no smoothing. squared[i] is an unbiased estimate
    after steps[i] steps and may be negative where E_n is small; error[i] is its standard error (eq 7.18), somewhat too
    large where nothing of E_n is left. Both have `times` values. What lies beyond K is not in the sum: for a uniform
-   perturbation and n = 1 it is about 2/(pi^2 Delta^2 K), for larger n far less. Returns the errors of the chain,
-   METRO_ERROR_ARGUMENT also for no harmonics, times, chains or seeds, for step numbers that fall, for an axis that is
-   a direction, for over 2^20 modes or fewer than 4 jobs; then the outputs are untouched. Costs chains * (last step +
-   times * axes * modes) and some 32 bytes a job, time and mode. */
+   perturbation on one circle and n = 1 it is about 1/(pi^2 Delta^2 K), for larger n far less. Returns the errors of
+   the chain, METRO_ERROR_ARGUMENT also for no harmonics, times, chains or seeds, for step numbers that fall, for an
+   axis that is a direction, for over 2^20 modes or fewer than 4 jobs; then the outputs are untouched. Costs chains *
+   (last step + times * axes * modes) and some 32 bytes a job, time and mode. */
 METRO_API metro_result metro_ensemble_measure(const metro_ensemble *ensemble, double *squared, double *error);
 
 /* # R8 Pictures
@@ -1371,7 +1380,7 @@ typedef struct {
 typedef struct {
     double mean, mean_error;       /* the mean luminance of the picture and its standard error. Even points (see
                                       random_numbers) are better than their error says */
-    double b, b_error;             /* the integral of the importance, and its standard error */
+    double b, b_error;             /* the integral of the importance, and its standard error: infinite where b is 0 */
     double acceptance;             /* the share of mutations that were accepted */
     double dark;                   /* the share of tentative states of zero importance */
     double squared_jump;           /* the mean squared distance of a mutation that is made, 0 for one that is not */
@@ -1446,7 +1455,7 @@ METRO_API void metro_render_free(metro_render *render);
        metro_bundles_run(&bundles, 1024, NULL, NULL);
        metro_bundles_image(&bundles, &image);
 
-   Both options lower the noise of a second; without them a picture is made as in the paper. */
+   Both options leave less noise after the same time; without them a picture is made as in the paper. */
 
 /* One patch: a part of a triangle, similar to it. */
 typedef struct {
@@ -1486,7 +1495,8 @@ METRO_API size_t metro_patches_at(const metro_patches *patches, uint32_t triangl
 typedef enum {
     METRO_SWEEP,      /* sweeps each row of the grid and keeps the triangles above each other in order: exact, unless
                          triangles pass through each other */
-    METRO_FRAGMENTS,  /* lists what each line meets and sorts the lists: exact, and slower */
+    METRO_FRAGMENTS,  /* lists what each line meets and sorts the lists: exact, and slower where triangles are larger
+                         than a cell */
     METRO_PAINTER,    /* paints whole patches in the order of their centres (the paper's time): wrong by a bias */
     METRO_LINES       /* METRO_SWEEP with infinitely many lines in each row: exact along the row */
 } metro_visibility;
@@ -1515,7 +1525,8 @@ typedef struct {
    finite, a grid of 0 or above 16384, a shift outside [0, 1), a visibility that there is not, patches that were not
    made, or a NULL; METRO_ERROR_MEMORY; then the outputs are unchanged. Cost: METRO_SWEEP and METRO_LINES one step for
    each row of the grid and each patch it crosses, and for each triangle in a row as many as there are triangles above
-   each other; METRO_FRAGMENTS one for each cell of each patch and as many as patches are above each other;
+   each other, or that begin in the same cell: triangles that are smaller than a cell are better moved by
+   METRO_FRAGMENTS; METRO_FRAGMENTS one for each cell of each patch and as many as patches are above each other;
    METRO_PAINTER one for each cell of each patch; and memory for all that is allocated and cleared. A run of walks
    does so once. Source: Szirmay-Kalos and Purgathofer (1998); paper (19), eq 14.4. */
 METRO_API metro_result metro_bundle_transfer(const metro_patches *patches, metro_vec3 direction, size_t grid,
@@ -1544,7 +1555,8 @@ typedef struct {
     int run_on;                 /* METRO_WALK_EVEN, as a warning: one sequence in two coordinates runs on from one
                                    direction to the next, and converges to a wrong picture */
     int first_shot;             /* the light of the lamps is brought to each patch by a shadow ray in each walk, and
-                                   bundles move the rest; a walk has one direction less */
+                                   bundles move the rest; a walk has one direction less. The errors are too small for
+                                   patches that share an edge with a lamp (section 14.8) */
     int linear;                 /* METRO_SWEEP, METRO_LINES: radiance is linear over each patch, not constant */
     size_t batches;             /* independent replicates, or chains, whose spread gives the errors, 2 to 4096: 16 */
     uint64_t seed;
@@ -1565,7 +1577,7 @@ typedef struct {
     metro_bundles_options options;  /* with the defaults filled in */
     metro_patches patches;
     double *share;                  /* [patches.count]: the share of the picture that shows the patch */
-    uint64_t walks;                 /* made so far, all batches together */
+    uint64_t walks;                 /* rounds so far times batches; a chain that found no start makes none */
     uint64_t bundles, rays;         /* and what it took, with the starts of chains and their draws for b */
     void *state;
 } metro_bundles;
@@ -1574,7 +1586,8 @@ typedef struct {
 typedef struct {
     double mean, mean_error;  /* the mean luminance of the picture, with each patch by its share of it and even over
                                  the patch; and its error */
-    double b, b_error;        /* the integral of the importance, and its standard error */
+    double b, b_error;        /* the integral of the importance, and its standard error: infinite where b is 0 because
+                                 all draws that count were dark, and the picture is black */
     double acceptance;        /* the share of mutations that were accepted */
     double dark;              /* the share of tentative states of zero importance */
     double squared_jump;      /* the mean squared distance of a mutation that is made, 0 for one that is not */
@@ -1583,11 +1596,11 @@ typedef struct {
 
 /* Prepares to light `scene` by bundles and to show it as `camera` sees it; the scene is read during the runs and must
    stay. Cuts the patches and finds by 6 x 6 rays a pixel how much of the picture shows each. Returns
-   METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses, options out of
-   range or a NULL, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `bundles` is then unchanged.
-   Cost: 36 rays a pixel on one thread. Memory: 150 bytes a patch; and for each batch 110 to 210 bytes a patch, three
-   times as much where radiance is linear, 450 a triangle, 4 a cell for METRO_FRAGMENTS and METRO_PAINTER, and 16 for
-   each patch on each line for METRO_FRAGMENTS. Source: paper, section 3.3. */
+   METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses, options out of range
+   (NULL: all defaults) or another NULL, METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY;
+   `bundles` is then unchanged. Cost: 36 rays a pixel on one thread. Memory: 150 bytes a patch; and for each batch 110
+   to 210 bytes a patch, three times as much where radiance is linear, 450 a triangle, 4 a cell for METRO_FRAGMENTS
+   and METRO_PAINTER, and 16 for each patch on each line for METRO_FRAGMENTS. Source: paper, section 3.3. */
 METRO_API metro_result metro_bundles_make(const metro_scene *scene, const metro_camera *camera,
                                           const metro_bundles_options *options, metro_bundles *bundles);
 
@@ -1602,8 +1615,10 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
                                          int (*stop)(const metro_bundles *bundles, void *user), void *user);
 
 /* The radiance that each patch reflects to the eye, its own emission left out, and its standard error from the spread
-   over the batches (may be NULL). Both have patches.count items. With Metropolis walks only patches that are in the
-   picture are right, since walks that light only others have no importance. Returns METRO_ERROR_ARGUMENT before the
+   over the batches (may be NULL). Both have patches.count items. A diffuse patch that shows the eye its back
+   has the radiance of its front all the same, a glossy one 0. With Metropolis walks only patches that are in the
+   picture are right, since walks that light only others have no importance, and the error leaves out what the start
+   still does to the mean. Returns METRO_ERROR_ARGUMENT before the
    first walk or for a NULL; the outputs are then unchanged. Cost: one step for each patch and batch. */
 METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error);
 
@@ -3242,7 +3257,7 @@ static void metroi_state_perturb(const metro_target *target, const double *from,
 }
 
 /* The squared distance is the sum over the axes: the shorter way round a circle, the length of an interval, the angle
-   between directions, whose sine and cosine are the lengths of cross and dot product. */
+   between directions, whose sine is the length of the cross product and whose cosine is the dot product. */
 
 static double metroi_direction_angle(const double *a, const double *b)
 {
@@ -3418,7 +3433,7 @@ METROI_COLD
 /* # 4.5 Starting
 
    The seed decides what the first samples are, and the policies below are the ways to live with that. All of them end
-   here: a state whose importance is positive becomes the current one. */
+   alike: a state whose importance is positive becomes the current one. */
 
 static metro_result metroi_seed_check(double importance)
 {
@@ -7587,8 +7602,8 @@ METRO_API double metro_bernstein(const double *rho, size_t lags, uint64_t steps)
        rho_k = frac{gamma_k}{gamma_0},    gamma_k = frac{1}{n} sum_{i=1}^{n-k} (f_i - m) (f_{i+k} - m)       (7.3)
 
    Dividing by n rather than by the number of terms bends far lags towards 0; it also keeps the noise of far lags from
-   growing, and makes gamma the transform of something positive, which is worth more (Priestley 1981, pages 323 to
-   324).
+   growing, and its Fourier transform is then never negative, as that of a true autocovariance must be (Priestley
+   1981, pages 323 to 324).
 
    Written out the sums take n^2 steps for all lags. A discrete Fourier transform Z of the deviations, padded with as
    many zeros so that the ends do not meet, gives them all in n log n (the theorem of Wiener and Khinchin):
@@ -7698,8 +7713,8 @@ METRO_API metro_result metro_autocorrelation(const double *draw, size_t draws, s
    $rho_{2m} + rho_{2m+1}$ are positive and fall with m. So we add pairs while they are positive (the initial positive
    sequence) and let none be larger than the one before it (the initial monotone sequence).
 
-   Chains that have not met are no larger sample of the same thing. With m chains of n draws, W the mean of their
-   variances and V the variance of their means, Vehtari et al. (2021, section 3.2) take
+   Several chains are one larger sample only if they sample the same distribution. With m chains of n draws, W the
+   mean of their variances and V the variance of their means, Vehtari et al. (2021, section 3.2) take
 
        rho_k = 1 - frac{W - gamma_k}{gamma_0 + V},    W = frac{n}{n - 1} gamma_0                             (7.5)
 
@@ -7855,9 +7870,9 @@ METRO_API double metro_mcse_sd(const double *draw, size_t chains, size_t draws)
    with the mean rank for draws that are equal; Phi is the normal distribution function. What z says of the chains is
    the same for f and for any rising function of f.
 
-   The inverse of Phi is algorithm AS 241 (PPND16) of Wichura (1988), good to 1e-16: rational functions of p about the
-   middle and of the root of -ln p outside. His third piece, for p below 1.4e-11, belongs to more than 4e10 draws and
-   is left out. */
+   The inverse of Phi is algorithm AS 241 (PPND16) of Wichura (1988), good to some 1e-15: rational functions of p
+   about the middle and of the root of -ln p outside. His third piece, for p below 1.4e-11, belongs to more than 4e10
+   draws and is left out. */
 
 static double metroi_normal_quotient(const double *above, const double *below, double x)
 {
@@ -7999,7 +8014,7 @@ METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws)
     folded = metroi_draws_sorted(draw, count);
     if (folded == NULL) return METROI_NAN;
     median = 0.5 * folded[(count - 1) / 2] + 0.5 * folded[count / 2];
-    for (i = 0; i < count; i++) folded[i] = fabs(draw[i] - median);
+    for (i = 0; i < count; i++) folded[i] = fabs(0.5 * draw[i] - 0.5 * median); /* half of it cannot overflow */
     width = metroi_draws_ranked_rhat(folded, chains, draws);
     METRO_FREE(folded);
     return isnan(width) || width > place ? width : place;
@@ -8071,7 +8086,7 @@ METRO_API double metro_squared_jump(const double *draw, size_t draws, double per
     if (!(period >= 0) || isinf(period) || draws < 2 || !metroi_draws_usable(draw, 1, draws)) return METROI_NAN;
     for (i = 1; i < draws; i++) {
         double jump = draw[i] - draw[i - 1];
-        if (period > 0) jump = remainder(jump, period);
+        if (period > 0) jump = remainder(remainder(draw[i], period) - remainder(draw[i - 1], period), period);
         metro_sum_add(&sum, jump * jump); /* eq 7.12 */
     }
     return metro_sum_value(&sum) / (double)(draws - 1);
@@ -8184,7 +8199,8 @@ METRO_API const char *metro_draws_trouble(const double *draw, size_t chains, siz
     if (draws < 6) return "there are fewer than six draws a chain, so its halves have no autocorrelation";
     rhat = metro_rhat(draw, chains, draws);
     if (isnan(rhat))
-        return "R-hat cannot be said: all draws (but perhaps a middle one) are as far from the median, or no memory";
+        return "R-hat cannot be said: all draws (but perhaps a middle one) are equally far from the median, or "
+               "memory ran out";
     tau = metroi_draws_time_of(draw, chains, draws, 0);
     if (isnan(tau)) return "memory ran out";
     if (!((double)draws >= 50 * tau))
@@ -8249,7 +8265,8 @@ static double metroi_largest_importance(metro_chain *chain, uint64_t draws, doub
     return largest;
 }
 
-/* Draws the same states again, keeps each with probability I(x)/max I, and lets it step. */
+/* Draws the same states again, keeps each with probability I(x)/max I, and lets it step. Where it comes to a state
+   that is brighter than all that were drawn, the way back cannot be among the pairs, and so this one must not be. */
 static void metroi_flow_fill(metro_chain *chain, void (*step)(const double *, double *, metro_rng *, void *),
                              uint64_t draws, size_t cells, double *x, double *y, metro_rng rng, double *flow)
 {
@@ -8260,9 +8277,12 @@ static void metroi_flow_fill(metro_chain *chain, void (*step)(const double *, do
         metroi_state_draw(target, x, &rng);
         if (metro_chain_start_point(chain, x) != METRO_OK) continue;
         if (metro_rng_uniform(&chain->rng) * largest >= chain->importance) continue;
-        if (step != NULL) step(x, y, &chain->rng, target->user);
-        else {
+        if (step != NULL) {
+            step(x, y, &chain->rng, target->user);
+            if (target->importance(y, chain->tentative_sample, target->user) > largest) continue;
+        } else {
             metro_chain_step(chain);
+            if (chain->importance > largest) continue;
             memcpy(y, chain->state, metroi_state_doubles(target) * sizeof *y);
         }
         metroi_flow_add(target, x, y, cells, flow);
@@ -8289,8 +8309,9 @@ static metro_balance metroi_flow_score(const double *flow, size_t coordinate, si
         for (b = a + 1; b < cells; b++) {
             double there = flow[(coordinate * cells + a) * cells + b];
             double back = flow[(coordinate * cells + b) * cells + a];
-            double term = (there - back) * (there - back) / (there + back); /* eq 7.16 */
+            double term;
             if (there + back < 20) continue;
+            term = (there - back) * (there - back) / (there + back); /* eq 7.16 */
             score.chi_square += term;
             score.freedom += 1;
             if (term <= worst) continue;
@@ -8357,8 +8378,8 @@ METRO_API metro_result metro_balance_check(const metro_target *target,
 
        T_{ab} = sum_{k != 0} c_a(k) c_b(-k),    E_n^2 ~ frac{1}{J (J-1)} sum_{a != b} T_{ab}                 (7.17)
 
-   is unbiased: the estimate is 0 in the mean when the chains have forgotten their seed, and must be allowed to be
-   negative. A histogram would have a bias that depends on the width of its bins.
+   is unbiased: with a constant importance the estimate is 0 in the mean when the chains have forgotten their seed,
+   and must be allowed to be negative. A histogram would have a bias that depends on the width of its bins.
 
    This is a U-statistic, and the variance of such a mean over pairs can be estimated without bias from the same
    matrix. The product of two terms with four different groups has mean E_n^4, so
@@ -8389,12 +8410,13 @@ typedef struct {
     double *sums;     /* [job][time][mode][2]: sums over the chains of a job */
 } metroi_ensemble;
 
-/* The number of harmonics along an axis, and the product over all axes; 0 when there are too many. */
+/* The number of harmonics along an axis. */
 static size_t metroi_axis_modes(const metro_axis *axis, size_t harmonics)
 {
     return axis->kind == METRO_CIRCLE ? 2 * harmonics + 1 : harmonics + 1;
 }
 
+/* The number of modes; 0 when there are too many. */
 static size_t metroi_mode_count(const metro_target *target, size_t harmonics)
 {
     const size_t most = (size_t)1 << 20;
@@ -14554,7 +14576,7 @@ static void metroi_chains_report(const metro_render *render, metro_render_report
     size_t c;
     metroi_chains_moments(plan, &importance, &luminance);
     report->b = metro_moments_mean(&importance);
-    report->b_error = metro_moments_error(&importance);
+    report->b_error = report->b > 0 ? metro_moments_error(&importance) : METROI_INFINITY;
     for (c = 0; c < plan->options->chains; c++) {
         const metro_chain_counts *counts = &plan->walker[c].chain.counts;
         steps += (double)counts->steps;
@@ -14658,8 +14680,9 @@ METRO_API void metro_render_diagnose(const metro_render *render, metro_render_re
 
    A bundle needs something to hold the radiance of all surfaces at once. So the surfaces are cut into patches, and
    the radiance that a patch sends into one direction is a number (a colour), or linear in its plane. The price is
-   that a picture shows the mean over each patch. With the vector of the radiances of all patches, L(omega), their
-   emission L^e and their BRDFs, the diagonal matrix F, the equation of light becomes (paper (19))
+   that a picture shows no more than a constant, or a plane, over each patch. With the vector of the radiances of all
+   patches, L(omega), their emission L^e and their BRDFs, the diagonal matrix F, the equation of light becomes (paper
+   (19))
 
        L(omega) = L^e + int F(omega', omega) A(omega') L(omega') d omega',   A_{ij} = frac{A(i, j, omega')}{A_i}
                                                                                       (14.1)
@@ -14950,8 +14973,9 @@ METROI_INLINE int metroi_comes_first(double depth_a, int up_a, size_t a, double 
 
    Sorting patches instead of triangles would repeat for every patch what is the same for all patches of a triangle.
    Two spans are compared once, in the middle of what they have in common, which is enough where surfaces at most
-   touch. Where triangles pass through each other the sweep takes one of them for the upper one all along, and two
-   squares that cross may be off by a tenth; such scenes are for the fragments of section 14.4.
+   touch. Where triangles pass through each other the sweep takes one of them for the upper one all along, and
+   half a square behind one that crosses it, which should receive nothing, may receive a fifth of what the other half
+   does; such scenes are for the fragments of section 14.4.
 
    Along the stretch the patch of a triangle changes where $s$, $t$ or $s + t$ of eq 14.2 passes a whole number. That
    gives three arithmetic sequences of places, and their merging is simple: a patch with k = 0 is left into one with
@@ -15295,9 +15319,9 @@ static void metroi_sweep_row(metroi_bundle *bundle, size_t spans, double y, int 
     }
 }
 
-/* The spans of a row: those of the row before that go on, and those that begin, each cut at y. They are nearly in
-   order already, so they are sorted by insertion. Spans that meet no line are left out of the row, but not of the
-   next. */
+/* The spans of a row: those of the row before that go on, and those that begin, each cut at y. Where triangles are
+   larger than a cell they are nearly in order already, so they are sorted by insertion. Spans that meet no line are
+   left out of the row, but not of the next. */
 
 static size_t metroi_sweep_cut(metroi_bundle *bundle, size_t *live, int32_t row, int whole_lines)
 {
@@ -15889,7 +15913,11 @@ static void metroi_walk_show(metroi_batch *batch, const metro_vec3 *in, double *
        H_i = frac{L^e cos(theta_p) cos(theta_y)}{d^2 p_A} V(p, y)                     (14.9)
 
    with p_A of eq 11.3 is an unbiased estimate of the mean irradiance of the patch. From there on the patches send
-   what they reflect of it in place of their emission, and the walk has one direction less. */
+   what they reflect of it in place of their emission, and the walk has one direction less.
+
+   Where a lamp and a patch meet in an edge, d can be as small as one likes, and with P(H > h) falling as h^{-3/2} the
+   variance of H is infinite: such a patch is right in the mean, but more often too dark than too bright, and the
+   error that is stated of it is too small. A lamp that hangs a little free, as lamps do, has no such edge. */
 
 static void metroi_shoot_patch(metroi_batch *batch, size_t i, metro_rng *rng)
 {
@@ -16156,9 +16184,9 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
 
    The last step is a final gathering: through each pixel go 6 x 6 rays, and each sees the radiance of the patch that
    it meets. No two of them are in one column or one row of 36 x 36 cells of the pixel, so that even an edge along the
-   pixels is seen where it is to a 36th. In each pixel they are shifted by random numbers of its own, and what they
-   miss they miss on either side. The share v_i of a patch in the picture is what the same rays find, so that no patch
-   is seen whose light a chain does not look for.
+   pixels is seen where it is to a 36th. Each pixel shifts them by random numbers of its own, round its borders, so
+   that what neighbouring pixels miss is independent. The share v_i of a patch in the picture is what the same rays
+   find, so that no patch is seen whose light a chain does not look for.
 
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
@@ -16458,8 +16486,8 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
     return metro_rounds_run(&rounds, plan);
 }
 
-/* What a batch's sums count: the mean over its walks, times b for chains that do not carry Veach's weight (eq 4.1).
-   Of these a chain that found no start says nothing; one that carries a weight says 0. */
+/* The factor of a batch's sums: one over its walks, and b for chains that do not carry Veach's weight (eq 4.1). Of
+   these a chain that found no start is left out; one that would carry a weight counts as 0. */
 
 static double metroi_bundles_b(const metroi_bundles *plan, double *error)
 {
@@ -16468,7 +16496,7 @@ static double metroi_bundles_b(const metroi_bundles *plan, double *error)
     memset(&moments, 0, sizeof moments);
     for (i = 0; i < plan->options.batches; i++)
         metroi_moments_join(&moments, &plan->batch[i].chain.normalisation);
-    *error = metro_moments_error(&moments);
+    *error = metro_moments_mean(&moments) > 0 ? metro_moments_error(&moments) : METROI_INFINITY;
     return metro_moments_mean(&moments);
 }
 
@@ -16488,7 +16516,7 @@ static metroi_bundles_scale metroi_bundles_scale_of(const metroi_bundles *plan)
     if (plan->options.walk != METRO_WALK_METROPOLIS || plan->options.start == METRO_START_WEIGHTED) return scale;
     b = metroi_bundles_b(plan, &error);
     scale.scale *= b;
-    scale.b_share = error / b;
+    scale.b_share = b > 0 ? error / b : METROI_INFINITY;
     scale.all = 0;
     return scale;
 }

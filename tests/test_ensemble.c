@@ -148,6 +148,27 @@ static void planted_mistakes_are_found(void)
     CHECK(balance.probability > 1e-6, "the right ratio: chi-square %g of %g", balance.chi_square, balance.freedom);
 }
 
+/* A peak so narrow that uniform draws miss it, and a proposal that finds it every other time. */
+static double needle(double x) { return x >= .3 && x < .3 + 1e-7 ? 1e7 + 1 : 1; }
+
+static double propose_needle(const double *from, double *to, metro_rng *rng, void *user)
+{
+    (void)user;
+    *to = metro_rng_uniform(rng) < .5 ? metro_rng_uniform(rng) : .3 + 1e-7 * metro_rng_uniform(rng);
+    return needle(*from) / needle(*to);
+}
+
+static void peaks_that_draws_miss(void)
+{
+    metro_axis axis = axis_of(METRO_INTERVAL, METRO_UNIFORM, .2);
+    function_of_x *function = needle;
+    metro_target target = target_of(&axis, 1, call_importance, &function);
+    metro_balance balance;
+    target.propose = propose_needle;
+    balance = balance_of(&target, NULL, 16);
+    CHECK(balance.probability > 1e-6, "chi-square %g of %g", balance.chi_square, balance.freedom);
+}
+
 /* The probability of a score follows the score: over many seeds the probabilities of a correct chain are uniform. */
 static void probabilities_are_uniform(void)
 {
@@ -388,6 +409,7 @@ int main(void)
     CHECK_RUN(balanced_chains_pass);
     CHECK_RUN(balance_of_directions);
     CHECK_RUN(planted_mistakes_are_found);
+    CHECK_RUN(peaks_that_draws_miss);
     CHECK_RUN(probabilities_are_uniform);
     CHECK_RUN(balance_refuses_nonsense);
     CHECK_RUN(ensembles_meet_the_theory);
