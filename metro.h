@@ -16193,8 +16193,19 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
 
 enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
 
-/* The patch that ray number `ray` through pixel (x, y) sees from its front, and where it was hit; the number of
-   patches if there is none. `shift` holds the random numbers of the pixel. */
+/* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
+   none. */
+
+static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y, metro_hit *hit)
+{
+    metro_vec3 direction = metroi_camera_direction(&plan->camera, x, y);
+    if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, hit)
+        || !(metro_dot(plan->facet[hit->triangle].normal, direction) < 0))
+        return plan->patches.count;
+    return metro_patches_at(&plan->patches, hit->triangle, hit->u, hit->v);
+}
+
+/* The same for ray number `ray` through pixel (x, y), whose random numbers are in `shift`. */
 
 static void metroi_gather_shift(const metroi_bundles *plan, size_t x, size_t y, double shift[2])
 {
@@ -16209,12 +16220,7 @@ static size_t metroi_gather_look(const metroi_bundles *plan, size_t x, size_t y,
     const int side = METROI_GATHER_SIDE, column = ray % side, row = ray / side;
     double u = (double)(column * side + row) / (side * side) + shift[0];
     double v = (double)(row * side + column) / (side * side) + shift[1];
-    metro_vec3 direction = metroi_camera_direction(&plan->camera, (double)x + (u < 1 ? u : u - 1),
-                                                   (double)y + (v < 1 ? v : v - 1));
-    if (!metro_scene_hit(plan->scene, plan->camera.eye, direction, 0, METROI_INFINITY, hit)
-        || !(metro_dot(plan->facet[hit->triangle].normal, direction) < 0))
-        return plan->patches.count;
-    return metro_patches_at(&plan->patches, hit->triangle, hit->u, hit->v);
+    return metroi_bundles_look(plan, (double)x + (u < 1 ? u : u - 1), (double)y + (v < 1 ? v : v - 1), hit);
 }
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)

@@ -114,6 +114,11 @@ if have gcc; then
     later "no private macro leaks" \
         "gcc -std=c99 -dM -E $work/all.c | grep 'define METROI_' | grep -vE 'METROI_(UNUSED|H)\b' || true"
 fi
+if have gcc; then
+    later "examples, without a warning" "for f in examples/*.c; do
+            gcc -std=c99 -Wall -Wextra -pedantic -fsyntax-only \$f
+        done"
+fi
 later "pure ASCII" "LC_ALL=C grep -n '[^ -~	]' metro.h tests/*.[ch] examples/*.[ch] docs/*.c || true"
 together
 
