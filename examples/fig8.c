@@ -21,7 +21,7 @@
    of size.
 
    See: random and even walks go together, and no perturbation comes near; the smaller it is the worse it gets. On
-   the second sheet: from fixed points and by small perturbations most of the squared error is bias, and stays so;
+   the second sheet: from fixed points and by small perturbations much of the squared error is bias, and stays so;
    seeds chosen by importance leave hardly any, but the variance of walks that resemble each other.
 
    Writes out/fig8.svg, out/fig8.csv (fixed starts), out/fig8_starts.svg, out/fig8_starts.csv. There, error is the
