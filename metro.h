@@ -21,7 +21,7 @@
    - METRO_MALLOC, METRO_REALLOC, METRO_FREE: all three, another allocator.
    - METRO_NO_THREADS: leaves out POSIX threads; runs use one.
    - METRO_NO_TRACER: leaves out chapters 9 to 14, so that a lesson on the sampler compiles in a blink.
-   - METRO_NO_SIMD: rays are traced in plain C, for the same pictures in twice the time.
+   - METRO_NO_SIMD: rays are traced in plain C, at half the speed, for the same pictures.
    - METRO_ASSERT(condition): what to do about a programmer's error, the start of a chain that was not made; `assert`
      otherwise.
 
@@ -893,8 +893,8 @@ METRO_API metro_result metro_best_size(double (*importance)(double x, void *user
 
    What cannot be said is NaN, and `metro_draws_trouble` says why (of all but metro_ess_tail). It is always NaN when a
    draw is not finite, when all draws are equal (but for metro_squared_jump, which is 0), when there are no draws and
-   when memory runs out. No function averages the chains before it
-   looks at them: the mean over chains that sit in different places looks like one chain that moves well. */
+   when memory runs out. No function averages the chains before it looks at them: the mean over chains that sit in
+   different places looks like one chain that moves well. */
 
 /* The autocorrelation of one chain, rho[k] for the lags k = 0 .. lags - 1 (eq 7.3); rho[0] = 1. The estimate divides
    by `draws`, not by draws - k, which bends far lags towards 0 and keeps their noise small. NaN throughout where it
@@ -921,19 +921,19 @@ METRO_API double metro_autocorrelation_time(const double *draw, size_t chains, s
    middle draw of an odd number is left out. NaN under six draws a chain; the tail also when the quantile at .95 is
    the largest draw, since then no draw lies beyond it. An antithetic chain is worth more than its draws, at most
    log10 of their number times as much; but where already the first pair of correlations is not positive, the rule
-   says half of them. Cost as metro_autocorrelation_time, and a sort. Source: Vehtari, Gelman,
-   Simpson, Carpenter and Buerkner (2021); the same numbers as their R package posterior. */
+   says half of them. Cost as metro_autocorrelation_time, and a sort. Source: Vehtari, Gelman, Simpson, Carpenter and
+   Buerkner (2021); the same numbers as their R package posterior. */
 METRO_API double metro_ess(const double *draw, size_t chains, size_t draws);
 METRO_API double metro_ess_tail(const double *draw, size_t chains, size_t draws);
 METRO_API double metro_ess_mean(const double *draw, size_t chains, size_t draws);
 
 /* R-hat, how much chains and their halves disagree: 1 when they look alike, and below 1.01 for results one trusts. It
    takes the larger of two values, on ranks of the draws (do the chains sit in the same place?) and on ranks of their
-   distances from the median (are they as wide?). +INFINITY when each half of each chain stands still, in its
-   place or in its distance from the median, and not all in the same. NaN under four draws a chain, or when all draws
-   (but a middle one of an odd number, which is left out) are equally far from the median. It compares chains with
-   each other, never with the truth: where no chain has been, it knows nothing. Cost: three sorts. Source: Vehtari et
-   al. (2021), rank-normalised split R-hat; the same numbers as posterior, but where all halves stand still. */
+   distances from the median (are they as wide?). +INFINITY when each half of each chain stands still, in its place or
+   in its distance from the median, and not all in the same. NaN under four draws a chain, or when all draws (but a
+   middle one of an odd number, which is left out) are equally far from the median. It compares chains with each
+   other, never with the truth: where no chain has been, it knows nothing. Cost: three sorts. Source: Vehtari et al.
+   (2021), rank-normalised split R-hat; the same numbers as posterior, but where all halves stand still. */
 METRO_API double metro_rhat(const double *draw, size_t chains, size_t draws);
 
 /* The Monte Carlo standard error of the mean of all draws, and of their standard deviation: the deviation of the
@@ -965,11 +965,10 @@ typedef struct {
    values (the samples of a picture, say) of the first run, then of the second; `truth` holds the true values. The
    errors are standard errors by the jackknife over runs, so that the values of one run may depend on each other;
    where there is no bias, `bias2_error` is too large by sqrt(2 (repeats - 1)/(repeats - 2)). Of a few values only it
-   says little where their bias happens to be near 0: look at the signed bias then. One repeat gives
-   the mean squared error only, two add bias^2, variance and the error of the mean squared error, three give all; the
-   rest is NaN. NaN or an
-   infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or a
-   NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
+   says little where their bias happens to be near 0: look at the signed bias then. One repeat gives the mean squared
+   error only, two add bias^2, variance and the error of the mean squared error, three give all; the rest is NaN. NaN
+   or an infinity in the input comes out as NaN or infinity. Returns METRO_ERROR_ARGUMENT for no repeats, no values or
+   a NULL, METRO_ERROR_MEMORY; then `out` is unchanged. Cost: three passes over the estimates and 24 bytes a repeat.
    Source: Tukey (1958), Efron and Stein (1981). */
 METRO_API metro_result metro_repeats(const double *estimate, const double *truth, size_t repeats, size_t values,
                                      metro_bias_variance *out);
@@ -1099,8 +1098,8 @@ typedef struct {
 /* Compares `image` with `reference`, which has the same size and channels. A NaN or an infinity in either picture
    makes the sums NaN or infinite, as it must; one NaN and `largest` is NaN and names its pixel. A black reference
    makes the first infinite, or NaN if the picture is black too, and the second NaN if they have a black pixel in
-   common. Returns METRO_ERROR_ARGUMENT when the pictures differ in
-   shape, are empty or NULL, and then `difference` is unchanged. Cost: linear. */
+   common. Returns METRO_ERROR_ARGUMENT when the pictures differ in shape, are empty or NULL, and then `difference` is
+   unchanged. Cost: linear. */
 METRO_API metro_result metro_image_error(const metro_image *image, const metro_image *reference,
                                          metro_image_difference *difference);
 
@@ -1177,26 +1176,24 @@ METRO_API metro_result metro_scene_add_triangle(metro_scene *scene, const metro_
    A polygon of n corners makes n - 2 triangles: a convex one, or any that can be seen whole from its first corner,
    the fan from there; any other the ears that are cut off it in its own plane. Polygons without area, or with a
    corner that is not finite, are fans, of which the triangles without area, or with such a corner, are never hit. A
-   face uses vertices that stand above it. Read are `v`, `f`, `usemtl`, `mtllib`; of an
-   MTL file `newmtl`, `Kd`, `Ks`, `Ns`, `Ke` (one number for all colours, or three). What a material does not say is
-   0, except that one with neither Kd nor Ke has the Kd of material 0. The camera stands in a comment, of which the
-   last one counts:
+   face uses vertices that stand above it. Read are `v`, `f`, `usemtl`, `mtllib`; of an MTL file `newmtl`, `Kd`, `Ks`,
+   `Ns`, `Ke` (one number for all colours, or three). What a material does not say is 0, except that one with neither
+   Kd nor Ke has the Kd of material 0. The camera stands in a comment, of which the last one counts:
 
        # camera eye 0 1 4 look 0 1 0 up 0 1 0 fov 40
 
    Returns METRO_OK, METRO_ERROR_FILE (the OBJ cannot be read), METRO_ERROR_FORMAT (a line is wrong, or there is no
    face at all), METRO_ERROR_MEMORY or METRO_ERROR_ARGUMENT (a NULL, or a scene that is built already). Then the scene
-   is unchanged, nothing stays allocated, and `message` says what is wrong, as "FILE:LINE: what", or
-   "FILE: what" where no line is to blame. On success it holds
-   the warnings, one a line, and each kind once, with the place where it was met first: an MTL file or a material that
-   is missing (material 0 stands in); Kd above 1 (taken as 1), Kd + Ks above 1 (Ks is taken as 1 - Kd), a negative
-   number (taken as 0); a transparency (d, Tr), texture (map_) or illumination model (illum) that would change the
-   picture, which are not read; a face of fewer than three corners (left out), a polygon that ears cannot be cut from
-   since it crosses itself, or with too many corners for that (a fan all the same), a vertex that is not finite, a
-   camera line of another form (left out). Without warnings `message` is empty. It is cut to `message_size` bytes with
-   its closing zero, and may be NULL when that is 0. Cost: linear in the size of the files; the OBJ file is held in
-   memory meanwhile. Source: Wavefront's "Object files (.obj)" and "MTL material format", and what exporters make of
-   them. */
+   is unchanged, nothing stays allocated, and `message` says what is wrong, as "FILE:LINE: what", or "FILE: what"
+   where no line is to blame. On success it holds the warnings, one a line, and each kind once, with the place where
+   it was met first: an MTL file or a material that is missing (material 0 stands in); Kd above 1 (taken as 1), Kd +
+   Ks above 1 (Ks is taken as 1 - Kd), a negative number (taken as 0); a transparency (d, Tr), texture (map_) or
+   illumination model (illum) that would change the picture, which are not read; a face of fewer than three corners
+   (left out), a polygon that ears cannot be cut from since it crosses itself, or with too many corners for that (a
+   fan all the same), a vertex that is not finite, a camera line of another form (left out). Without warnings
+   `message` is empty. It is cut to `message_size` bytes with its closing zero, and may be NULL when that is 0. Cost:
+   linear in the size of the files; the OBJ file is held in memory meanwhile. Source: Wavefront's "Object files
+   (.obj)" and "MTL material format", and what exporters make of them. */
 METRO_API metro_result metro_scene_load_obj(metro_scene *scene, const char *path, char *message, size_t message_size);
 
 /* The same from `obj_size` bytes of OBJ at `obj` and `mtl_size` bytes of MTL at `mtl`, which stand for the MTL files
@@ -1615,11 +1612,11 @@ METRO_API metro_result metro_bundles_run(metro_bundles *bundles, uint64_t walks,
                                          int (*stop)(const metro_bundles *bundles, void *user), void *user);
 
 /* The radiance that each patch reflects to the eye, its own emission left out, and its standard error from the spread
-   over the batches (may be NULL). Both have patches.count items. A diffuse patch that shows the eye its back
-   has the radiance of its front all the same, a glossy one 0. With Metropolis walks only patches that are in the
-   picture are right, since walks that light only others have no importance, and the error leaves out what the start
-   still does to the mean. Returns METRO_ERROR_ARGUMENT before the
-   first walk or for a NULL; the outputs are then unchanged. Cost: one step for each patch and batch. */
+   over the batches (may be NULL). Both have patches.count items. A diffuse patch that shows the eye its back has the
+   radiance of its front all the same, a glossy one 0. With Metropolis walks only patches that are in the picture are
+   right, since walks that light only others have no importance, and the error leaves out what the start still does to
+   the mean. Returns METRO_ERROR_ARGUMENT before the first walk or for a NULL; the outputs are then unchanged. Cost:
+   one step for each patch and batch. */
 METRO_API metro_result metro_bundles_radiance(const metro_bundles *bundles, metro_vec3 *radiance, metro_vec3 *error);
 
 /* Makes `image` and fills it with the picture so far, linear radiance: the final gathering, with 6 x 6 rays for each
@@ -8086,7 +8083,8 @@ METRO_API double metro_squared_jump(const double *draw, size_t draws, double per
     if (!(period >= 0) || isinf(period) || draws < 2 || !metroi_draws_usable(draw, 1, draws)) return METROI_NAN;
     for (i = 1; i < draws; i++) {
         double jump = draw[i] - draw[i - 1];
-        if (period > 0) jump = remainder(remainder(draw[i], period) - remainder(draw[i - 1], period), period);
+        if (isinf(jump) && period > 0) jump = remainder(draw[i], period) - remainder(draw[i - 1], period);
+        if (period > 0) jump = remainder(jump, period);
         metro_sum_add(&sum, jump * jump); /* eq 7.12 */
     }
     return metro_sum_value(&sum) / (double)(draws - 1);
@@ -9142,19 +9140,14 @@ static metro_result metroi_output_open(const char *path, metroi_output *output)
 /* Closes the file and puts it in its place. A full disk may show only here, when the last block is written. */
 static metro_result metroi_output_close(metroi_output *output)
 {
-    int good = !ferror(output->file);
+    int good = !ferror(output->file), keep = 0;
     good = fclose(output->file) == 0 && good;
     if (output->sibling != NULL) {
 #ifdef _WIN32
-        if (good) remove(output->path); /* rename does not replace there; when it fails, the sibling stays */
-        if (good && rename(output->sibling, output->path) != 0) {
-            METRO_FREE(output->sibling);
-            return METRO_ERROR_FILE;
-        }
-#else
-        good = good && rename(output->sibling, output->path) == 0;
+        keep = good && remove(output->path) == 0; /* rename does not replace there; where it fails, this is left */
 #endif
-        if (!good) remove(output->sibling);
+        good = good && rename(output->sibling, output->path) == 0;
+        if (!good && !keep) remove(output->sibling);
         METRO_FREE(output->sibling);
     }
     return good ? METRO_OK : METRO_ERROR_FILE;
@@ -9340,8 +9333,8 @@ METRO_API metro_result metro_image_noise(const metro_image *reference, const met
 
    A corner is three floats. Rounding it once, when it is added, and taking everything from the rounded numbers means
    that the ray tracer, the lamps and the normals all speak of the same triangle: no light leaks where two of them
-   would disagree by a digit. What is computed from the corners is computed in double. The product of two edges
-   has a size between 1e-90 and 1e78, so its square neither overflows nor vanishes, and no scaling is needed.
+   would disagree by a digit. What is computed from the corners is computed in double. The product of two edges has a
+   size between 1e-90 and 1e78, so its square neither overflows nor vanishes, and no scaling is needed.
 
    These small functions are asked at every hit, and what is METROI_INLINE is inlined where it is used. Vectors then
    stay in registers, which makes the walks of chapter 12 up to a tenth faster. */
@@ -13595,7 +13588,8 @@ static double metroi_sample_importance(metroi_walker *walker, metroi_sample *sam
         importance += value;
     }
     walker->rays += sample->rays;
-    if (walker->independent) metro_moments_add(&walker->brightness, isfinite(importance) ? walker->luminance : 0);
+    if (!isfinite(importance)) walker->luminance = 0; /* the chain counts it as dark */
+    if (walker->independent) metro_moments_add(&walker->brightness, walker->luminance);
     sample->importance = importance;
     return importance;
 }
@@ -14012,8 +14006,7 @@ static metro_result metroi_walk_work(uint64_t job, void *slot, void *user)
     for (i = 0; i < plan->group_steps; i++) {
         uint64_t large = chain->counts.large_steps;
         metro_chain_step(chain);
-        if (chain->counts.large_steps > large)
-            metro_moments_add(&walker->brightness, isfinite(walker->luminance) ? walker->luminance : 0);
+        if (chain->counts.large_steps > large) metro_moments_add(&walker->brightness, walker->luminance);
     }
     metro_chain_flush(chain);
     if (!(plan->options->large_step > 0)) { /* b has no other source: one draw for sixteen mutations */
@@ -14166,6 +14159,12 @@ static void metroi_moments_join(metro_moments *to, const metro_moments *from)
     to->mean = a * to->mean + deviation * m / (n + m);
     to->count += from->count;
     to->scale = scale;
+}
+
+/* Draws that were all dark say that b is 0, and not how far from it b may be. */
+static double metroi_b_error(const metro_moments *importance)
+{
+    return metro_moments_mean(importance) == 0 ? METROI_INFINITY : metro_moments_error(importance);
 }
 
 static void metroi_chains_moments(const metroi_metropolis *plan, metro_moments *importance, metro_moments *luminance)
@@ -14576,7 +14575,7 @@ static void metroi_chains_report(const metro_render *render, metro_render_report
     size_t c;
     metroi_chains_moments(plan, &importance, &luminance);
     report->b = metro_moments_mean(&importance);
-    report->b_error = report->b > 0 ? metro_moments_error(&importance) : METROI_INFINITY;
+    report->b_error = metroi_b_error(&importance);
     for (c = 0; c < plan->options->chains; c++) {
         const metro_chain_counts *counts = &plan->walker[c].chain.counts;
         steps += (double)counts->steps;
@@ -14973,9 +14972,9 @@ METROI_INLINE int metroi_comes_first(double depth_a, int up_a, size_t a, double 
 
    Sorting patches instead of triangles would repeat for every patch what is the same for all patches of a triangle.
    Two spans are compared once, in the middle of what they have in common, which is enough where surfaces at most
-   touch. Where triangles pass through each other the sweep takes one of them for the upper one all along, and
-   half a square behind one that crosses it, which should receive nothing, may receive a fifth of what the other half
-   does; such scenes are for the fragments of section 14.4.
+   touch. Where triangles pass through each other the sweep takes one of them for the upper one all along, and half a
+   square behind one that crosses it, which should receive nothing, may receive a fifth of what the other half does;
+   such scenes are for the fragments of section 14.4.
 
    Along the stretch the patch of a triangle changes where $s$, $t$ or $s + t$ of eq 14.2 passes a whole number. That
    gives three arithmetic sequences of places, and their merging is simple: a patch with k = 0 is left into one with
@@ -16191,7 +16190,7 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
 
-enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6 };
+enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6, METROI_GATHER_RAYS = 36 };
 
 /* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
    none. */
@@ -16205,8 +16204,6 @@ static size_t metroi_bundles_look(const metroi_bundles *plan, double x, double y
     return metro_patches_at(&plan->patches, hit->triangle, hit->u, hit->v);
 }
 
-/* The same for ray number `ray` through pixel (x, y), whose random numbers are in `shift`. */
-
 static void metroi_gather_shift(const metroi_bundles *plan, size_t x, size_t y, double shift[2])
 {
     metro_rng rng = metro_rng_make(metroi_mix(plan->key + 2), y * plan->options.width + x);
@@ -16214,32 +16211,33 @@ static void metroi_gather_shift(const metroi_bundles *plan, size_t x, size_t y, 
     shift[1] = metro_rng_uniform(&rng);
 }
 
+/* What ray number `ray` through pixel (x, y) sees. */
+
 static size_t metroi_gather_look(const metroi_bundles *plan, size_t x, size_t y, const double shift[2], int ray,
                                  metro_hit *hit)
 {
     const int side = METROI_GATHER_SIDE, column = ray % side, row = ray / side;
-    double u = (double)(column * side + row) / (side * side) + shift[0];
-    double v = (double)(row * side + column) / (side * side) + shift[1];
+    double u = (double)(column * side + row) / METROI_GATHER_RAYS + shift[0];
+    double v = (double)(row * side + column) / METROI_GATHER_RAYS + shift[1];
     return metroi_bundles_look(plan, (double)x + (u < 1 ? u : u - 1), (double)y + (v < 1 ? v : v - 1), hit);
 }
 
 static void metroi_bundles_shares(const metroi_bundles *plan, double *share)
 {
-    const int rays = METROI_GATHER_SIDE * METROI_GATHER_SIDE;
     size_t x, y;
     int ray;
     for (y = 0; y < plan->options.height; y++)
         for (x = 0; x < plan->options.width; x++) {
             double shift[2];
             metroi_gather_shift(plan, x, y, shift);
-            for (ray = 0; ray < rays; ray++) {
+            for (ray = 0; ray < METROI_GATHER_RAYS; ray++) {
                 metro_hit hit;
                 size_t patch = metroi_gather_look(plan, x, y, shift, ray, &hit);
                 if (patch < plan->patches.count) share[patch] += 1;
             }
         }
     for (x = 0; x < plan->patches.count; x++)
-        share[x] /= (double)rays * (double)plan->options.width * (double)plan->options.height;
+        share[x] /= (double)METROI_GATHER_RAYS * (double)plan->options.width * (double)plan->options.height;
 }
 
 static void metroi_bundles_free(metroi_bundles *plan)
@@ -16502,7 +16500,7 @@ static double metroi_bundles_b(const metroi_bundles *plan, double *error)
     memset(&moments, 0, sizeof moments);
     for (i = 0; i < plan->options.batches; i++)
         metroi_moments_join(&moments, &plan->batch[i].chain.normalisation);
-    *error = metro_moments_mean(&moments) > 0 ? metro_moments_error(&moments) : METROI_INFINITY;
+    *error = metroi_b_error(&moments);
     return metro_moments_mean(&moments);
 }
 
@@ -16522,7 +16520,7 @@ static metroi_bundles_scale metroi_bundles_scale_of(const metroi_bundles *plan)
     if (plan->options.walk != METRO_WALK_METROPOLIS || plan->options.start == METRO_START_WEIGHTED) return scale;
     b = metroi_bundles_b(plan, &error);
     scale.scale *= b;
-    scale.b_share = b > 0 ? error / b : METROI_INFINITY;
+    scale.b_share = error / b;
     scale.all = 0;
     return scale;
 }
@@ -16600,12 +16598,11 @@ static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
 {
     const metroi_bundles *plan = gather->plan;
     double *pixel = gather->image->value + 3 * (y * gather->image->width + x);
-    const int rays = METROI_GATHER_SIDE * METROI_GATHER_SIDE;
-    const double share = 1.0 / rays;
+    const double share = 1.0 / METROI_GATHER_RAYS;
     double shift[2];
     int ray;
     metroi_gather_shift(plan, x, y, shift);
-    for (ray = 0; ray < rays; ray++) {
+    for (ray = 0; ray < METROI_GATHER_RAYS; ray++) {
         metro_vec3 seen;
         metro_hit hit;
         size_t patch = metroi_gather_look(plan, x, y, shift, ray, &hit);

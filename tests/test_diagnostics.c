@@ -447,6 +447,7 @@ static void scales(void)
    chain. */
 static void squared_jump(void)
 {
+    static const double far_apart[2] = { 1.7e308, -1.7e308 };
     const double turn[5] = { .85, .95, .05, .15, .25 }, walk[4] = { 0, 1, 1, 3 };
     double bad[2] = { 0, 0 };
     CHECK_NEAR(metro_squared_jump(turn, 5, 1), .01, 1e-13);
@@ -454,6 +455,7 @@ static void squared_jump(void)
     CHECK_NEAR(metro_squared_jump(walk, 4, 0), 5.0 / 3, 1e-15);
     CHECK_NEAR(metro_squared_jump(walk, 4, 2.5), (1 + .25) / 3, 1e-15);
     CHECK(metro_squared_jump(bad, 2, 1) == 0, "a stay");
+    CHECK(metro_squared_jump(far_apart, 2, 1) <= .25, "%g round a circle", metro_squared_jump(far_apart, 2, 1));
     CHECK_NAN(metro_squared_jump(walk, 1, 0));
     CHECK_NAN(metro_squared_jump(walk, 0, 0));
     CHECK_NAN(metro_squared_jump(NULL, 4, 0));
@@ -560,6 +562,20 @@ static void repeats_jackknife(void)
         for (r = 0; r < REPEATS; r++) squares += (theta[k][r] - mean) * (theta[k][r] - mean);
         CHECK_NEAR(error, sqrt((double)(REPEATS - 1) / (double)REPEATS * squares), 1e-11);
     }
+}
+
+/* Draws at the end of the range have the R-hat of smaller ones. Catches: distances from the median that overflow. */
+static void rhat_of_large_draws(void)
+{
+    double small[400], large[400];
+    metro_rng rng = metro_rng_make(91, 0);
+    size_t i;
+    for (i = 0; i < 400; i++) {
+        small[i] = .999 * metro_rng_uniform(&rng) * (i < 200 ? 1 : .8) * (metro_rng_uniform(&rng) < .3 ? 1 : -1);
+        large[i] = ldexp(small[i], 1024);
+    }
+    CHECK(metro_rhat(large, 2, 200) == metro_rhat(small, 2, 200), "%.17g is not %.17g", metro_rhat(large, 2, 200),
+          metro_rhat(small, 2, 200));
 }
 
 static void repeats_edges(void)
@@ -730,6 +746,7 @@ int main(void)
     CHECK_RUN(squared_jump_is_first_correlation);
     CHECK_RUN(repeats_on_normals);
     CHECK_RUN(repeats_jackknife);
+    CHECK_RUN(rhat_of_large_draws);
     CHECK_RUN(repeats_edges);
     CHECK_RUN(islands_unseen);
     CHECK_RUN(acceptance_says_nothing);

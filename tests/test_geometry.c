@@ -889,6 +889,9 @@ static void odd_polygons(void)
                    "obj:3: a vertex is not finite: its triangles are never hit");
     CHECK(scene.triangle_count == 2, "%d triangles", (int)scene.triangle_count);
     metro_scene_free(&scene);
+    scene = good("v 3.4028235e38 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\n", NULL, 1, 0); /* rounds to the largest float */
+    CHECK(isfinite(scene.corner[0]), "the largest float is read as %g", (double)scene.corner[0]);
+    metro_scene_free(&scene);
     scene = warned("v 0 0 -1.#IND00\nv 1.#INF 1 0\nv 1 -1.#QNAN 0\nv 0 1e10000 -1e-10000\nf 1 2 3 4\n", NULL,
                    "obj:1: a vertex is not finite: its triangles are never hit");
     CHECK(!isfinite(scene.corner[2]) && !isfinite(scene.corner[3]) && !isfinite(scene.corner[7]), "-1.#IND is read");

@@ -697,6 +697,17 @@ static void reference(const char *name, double mean, double ratio_low, double ra
     metro_scene_free(&scene);
 }
 
+/* A run whose contributions are not all finite: they are counted, and said in words. */
+static metro_render run_counted(const metro_scene *scene, const metro_camera *camera,
+                                const metro_render_options *options, metro_render_report *report)
+{
+    metro_render render = render_run(scene, camera, options, 4);
+    metro_render_diagnose(&render, report);
+    CHECK(report->not_finite > 0 && strstr(report->warning, "NaN or infinite") != NULL, "%d counted, \"%s\"",
+          (int)report->not_finite, report->warning);
+    return render;
+}
+
 /* A lamp so bright that floats do not hold it, seen directly: counted, said in words, and left out of the picture and
    its mean. Catches: a test of the double before it is stored as a float. */
 static void beyond_floats(void)
@@ -711,13 +722,10 @@ static void beyond_floats(void)
     add_quad(&scene, metro_vec3_make(-0.3, -0.3, 0), metro_vec3_make(0.6, 0, 0), metro_vec3_make(0, 0.6, 0),
              add_material(&scene, grey(0), grey(0), 1, grey(1e39)));
     build(&scene);
-    render = render_run(&scene, &camera, &options, 4);
-    metro_render_diagnose(&render, &report);
+    render = run_counted(&scene, &camera, &options, &report);
     image = render_image(&render);
     for (i = 0; i < 3 * 16 * 16; i++) bad += !isfinite(image.value[i]);
     CHECK(bad == 0, "%d values are not finite", (int)bad);
-    CHECK(report.not_finite > 0 && strstr(report.warning, "NaN or infinite") != NULL, "%d counted, \"%s\"",
-          (int)report.not_finite, report.warning);
     CHECK(report.mean == 0, "mean %g", report.mean);
     metro_image_free(&image);
     metro_render_free(&render);
@@ -738,10 +746,7 @@ static void beyond_doubles(void)
     add_quad(&scene, metro_vec3_make(-2, 0, -2), metro_vec3_make(4, 0, 0), metro_vec3_make(0, 4, 0),
              add_material(&scene, grey(0.5), grey(0), 0, grey(1)));
     build(&scene);
-    render = render_run(&scene, &camera, &options, 8);
-    metro_render_diagnose(&render, &report);
-    CHECK(report.not_finite > 0 && strstr(report.warning, "NaN or infinite") != NULL, "%d counted, \"%s\"",
-          (int)report.not_finite, report.warning);
+    render = run_counted(&scene, &camera, &options, &report);
     metro_render_free(&render);
     metro_scene_free(&scene);
 }
