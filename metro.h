@@ -16217,8 +16217,8 @@ static size_t metroi_gather_look(const metroi_bundles *plan, size_t x, size_t y,
                                  metro_hit *hit)
 {
     const int side = METROI_GATHER_SIDE, column = ray % side, row = ray / side;
-    double u = (double)(column * side + row) / METROI_GATHER_RAYS + shift[0];
-    double v = (double)(row * side + column) / METROI_GATHER_RAYS + shift[1];
+    double u = (double)(column * side + row) / (double)METROI_GATHER_RAYS + shift[0];
+    double v = (double)(row * side + column) / (double)METROI_GATHER_RAYS + shift[1];
     return metroi_bundles_look(plan, (double)x + (u < 1 ? u : u - 1), (double)y + (v < 1 ? v : v - 1), hit);
 }
 
@@ -16598,7 +16598,7 @@ static void metroi_gather_pixel(const metroi_gather *gather, size_t x, size_t y)
 {
     const metroi_bundles *plan = gather->plan;
     double *pixel = gather->image->value + 3 * (y * gather->image->width + x);
-    const double share = 1.0 / METROI_GATHER_RAYS;
+    const double share = 1.0 / (double)METROI_GATHER_RAYS;
     double shift[2];
     int ray;
     metroi_gather_shift(plan, x, y, shift);
