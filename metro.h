@@ -1376,7 +1376,8 @@ typedef struct {
 /* What a careful person asks of a picture. NaN stands for what a method does not have. */
 typedef struct {
     double mean, mean_error;       /* the mean luminance of the picture and its standard error. Even points (see
-                                      random_numbers) are better than their error says */
+                                      random_numbers) are better than their error says, least with many
+                                      rounds */
     double b, b_error;             /* the integral of the importance, and its standard error: infinite where b is 0 */
     double acceptance;             /* the share of mutations that were accepted */
     double dark;                   /* the share of tentative states of zero importance */
@@ -13275,11 +13276,11 @@ static double metroi_log_add(metroi_log *log, const metroi_splat *splat, double 
 }
 
 /* A canvas holds sums: of the picture, of each way if asked for, and of the luminance of each block of 8 x 8 pixels
-   in batches - the chains of a Metropolis method, or groups of rounds - whose spread gives the errors of the blocks.
-   */
+   in batches - the chains of a Metropolis method, or runs of rounds - whose spread gives the errors of the blocks. */
 
 typedef struct {
     size_t width, height, columns, rows, batches;
+    uint64_t run;    /* rounds in a batch, without chains */
     double *sum;     /* [3 * width * height] */
     double *way;     /* [ways * 3 * width * height] or NULL */
     double *block;   /* [batches * columns * rows] */
@@ -13320,6 +13321,7 @@ static metro_result metroi_canvas_make(size_t width, size_t height, size_t batch
     canvas->columns = (width + 7) / 8;
     canvas->rows = (height + 7) / 8;
     canvas->batches = batches;
+    canvas->run = 1;
     canvas->depth = depth;
     canvas->sum = (double *)metroi_zeros(pixels, 3 * sizeof(double));
     canvas->block = (double *)metroi_zeros(batches, canvas->columns * canvas->rows * sizeof(double));
@@ -13366,7 +13368,7 @@ static void metroi_canvas_add(metroi_canvas *canvas, const metroi_log *log, size
    A round traces one path through each pixel. Its jobs take 256 pixels each, in groups of sixteen, so that the logs
    stay small whatever the size of the picture. */
 
-enum { METROI_JOB_PIXELS = 256, METROI_ROUND_JOBS = 16, METROI_PATH_BATCHES = 16, METROI_EVEN_PAIRS = 9,
+enum { METROI_JOB_PIXELS = 256, METROI_ROUND_JOBS = 16, METROI_PATH_BATCHES = 32, METROI_EVEN_PAIRS = 9,
        METROI_EYE_WALKS = 4 };
 
 typedef struct {
@@ -13445,14 +13447,30 @@ static metro_result metroi_path_merge(uint64_t job, const void *slot, void *user
     const metroi_path_plan *plan = (const metroi_path_plan *)user;
     const metroi_log *log = (const metroi_log *)slot;
     if (plan->look != NULL) plan->look(log, plan->user);
-    metroi_canvas_add(plan->canvas, log, (size_t)(job / plan->jobs) % plan->canvas->batches);
+    metroi_canvas_add(plan->canvas, log, (size_t)(job / plan->jobs / plan->canvas->run));
     return METRO_OK;
+}
+
+/* Each batch is a run of $2^k$ rounds, in which even points are as even as they are: the spread of such runs says
+   more of the picture than that of single rounds, or of every n-th. When all batches are full, neighbours become
+   one. */
+
+static void metroi_canvas_pair(metroi_canvas *canvas)
+{
+    size_t blocks = canvas->columns * canvas->rows, b, i;
+    for (b = 0; b < canvas->batches; b++) {
+        double *block = canvas->block + b * blocks;
+        const double *first = canvas->block + 2 * b * blocks, *second = first + blocks;
+        for (i = 0; i < blocks; i++) block[i] = 2 * b < canvas->batches ? first[i] + second[i] : 0;
+    }
+    canvas->run *= 2;
 }
 
 /* Round number `round`. */
 static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
 {
     metro_rounds rounds;
+    if (round / plan->canvas->run == plan->canvas->batches) metroi_canvas_pair(plan->canvas);
     memset(&rounds, 0, sizeof rounds);
     plan->jobs = metroi_path_jobs(plan->canvas->width * plan->canvas->height);
     rounds.jobs = METROI_ROUND_JOBS;
@@ -13885,7 +13903,7 @@ static metro_result metroi_pilot_run(metroi_metropolis *plan)
     metroi_path_plan paths;
     size_t ways = (size_t)(plan->tracer.depth + 1) * (size_t)(plan->tracer.depth + 2) / 2;
     size_t width = plan->canvas->width, height = plan->canvas->height;
-    metro_result result = metroi_canvas_make(width, height, 1, plan->tracer.depth, 0, &canvas);
+    metro_result result = metroi_canvas_make(width, height, METROI_PATH_BATCHES, plan->tracer.depth, 0, &canvas);
     if (result != METRO_OK) return result;
     if (!plan->options->all_connections) plan->way = (metroi_way *)metroi_zeros(ways, sizeof *plan->way);
     memset(&paths, 0, sizeof paths);
@@ -14434,7 +14452,9 @@ METRO_API metro_result metro_render_way(const metro_render *render, int s, int t
        "Var"(R) ~ frac{1}{C (C - 1)} sum_{c} frac{(B_c - R T_c)^2}{m^2}, m = frac{1}{C} sum_{c} T_c         (13.4)
 
    The relative error of the mean luminance is common to all blocks, and adds to it. Veach's weights need no scaling,
-   and the other methods have groups of rounds in place of chains: there B_c is compared with its own mean. */
+   and the other methods have runs of rounds in place of chains (section 12.8): there B_c is compared with its share
+   of the sum. Runs of even points also fit each other, which their spread does not show: the error that they state is
+   too large, least with many rounds, whose runs are long. */
 
 typedef struct {
     size_t left, right, top, bottom; /* in blocks of 8 x 8 pixels; right and bottom are outside */
@@ -14455,9 +14475,11 @@ static double metroi_window_expect(const metro_render *render, size_t c, double 
 {
     const metroi_render *state = (const metroi_render *)render->state;
     const metroi_canvas *canvas = &state->canvas;
-    uint64_t rounds = render->rounds / canvas->batches + (c < render->rounds % canvas->batches ? 1u : 0u);
-    if (!metroi_render_walks(&render->options))
+    if (!metroi_render_walks(&render->options)) {
+        uint64_t before = c * canvas->run, rounds = render->rounds > before ? render->rounds - before : 0;
+        if (rounds > canvas->run) rounds = canvas->run;
         return rounds > 0 ? sum * (double)rounds / (double)render->rounds : METROI_NAN;
+    }
     if (render->options.start == METRO_START_WEIGHTED) return sum / (double)canvas->batches;
     return state->chains.walker[c].alive ? sum / total * metroi_canvas_luminance(canvas, c) : METROI_NAN;
 }
@@ -14513,9 +14535,8 @@ METRO_API double metro_render_block(const metro_render *render, size_t column, s
     return mean;
 }
 
-/* The relative error of the mean luminance of a method without chains: the spread over the groups of rounds, or,
-   while there are few rounds, that over all groups of samples, which counts the differences between pixels as well.
-   */
+/* The relative error of the mean luminance of a method without chains: the spread over the runs of rounds, or, while
+   there are few rounds, that over all groups of samples, which counts the differences between pixels as well. */
 
 static double metroi_paths_error(const metro_render *render)
 {
@@ -14526,7 +14547,7 @@ static double metroi_paths_error(const metro_render *render)
     all.right = canvas->columns;
     all.bottom = canvas->rows;
     metroi_window_error(render, &all, &error);
-    return render->rounds >= canvas->batches ? error : metroi_canvas_error(canvas);
+    return render->rounds >= METROI_PATH_BATCHES / 2 ? error : metroi_canvas_error(canvas);
 }
 
 /* The largest relative error of the sixteenths of the picture. */

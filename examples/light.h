@@ -28,7 +28,11 @@ LIGHT_API int light_load(const char *program, const char *path, metro_scene *sce
     memset(scene, 0, sizeof *scene);
     result = metro_scene_load_obj(scene, path, message, sizeof message);
     if (message[0] != 0) fprintf(stderr, "%s: %s\n", program, message);
-    if (result == METRO_OK) result = metro_scene_build(scene);
+    if (result != METRO_OK) {
+        if (result == METRO_ERROR_FILE) fprintf(stderr, "%s: run it from the folder that metro.h is in\n", program);
+        return 1;
+    }
+    result = metro_scene_build(scene);
     if (result == METRO_OK) return 0;
     metro_scene_free(scene);
     return light_complain(program, path, result);
