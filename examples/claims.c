@@ -866,21 +866,19 @@ static double bundle_extreme(const table *t, int side)
     return found;
 }
 
-/* The share of bias^2 in all squared errors after at most `few` walks. One run gives them all, so their errors go
-   together and are added up as they are. */
+/* The share of bias^2 in the squared error, the mean over the numbers of walks up to `few`. One run gives them all, so
+   their errors go together and are added up as they are. */
 static outcome bundle_bias(const table *t, double perturbation, double few, finding *f)
 {
-    double b = 0, v = 0, b_error = 0, v_error = 0, all;
+    double share = 0, error = 0, rows = 0;
     size_t row;
     for (row = row_next(t, 0, "method=metropolis"); row > 0; row = row_next(t, row, "method=metropolis")) {
         if (number(t, row, "perturbation") != perturbation || number(t, row, "walks") > few) continue;
-        b += number(t, row, "bias2");
-        v += number(t, row, "variance");
-        b_error += number(t, row, "bias2_se");
-        v_error += number(t, row, "variance_se");
+        share += number(t, row, "share");
+        error += number(t, row, "share_se");
+        rows++;
     }
-    all = b + v;
-    decide(f, b / all, hypot(v * b_error, b * v_error) / (all * all), 0.5);
+    decide(f, share / rows, error / rows, 0.5);
     return judge(f->value, f->error, 0.5, 1);
 }
 

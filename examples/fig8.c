@@ -9,8 +9,10 @@
    not in it, and its own noise is subtracted. What lamps emit themselves is left out.
 
    Each run is two series of walks side by side (two chains, two sequences), of which it takes the mean, and there
-   are many independent runs. Metropolis chains start at a fixed point, one for each of the two: the same in all
-   runs, the first of uniform draws that is not dark; the second sheet compares other starts. How bright the picture
+   are many independent runs. Metropolis chains start at fixed points, one for each of the two, the first of uniform
+   draws that are not dark. What such a point leaves in the picture depends on the point, so there are twelve pairs of
+   points, each for a share of the runs, and bias and variance are means over the pairs; the second sheet compares
+   other starts. How bright the picture
    is in the mean is taken from the truth, but not with weighted seeds, which bring it along. What a start costs, up
    to 16 walks for a chain, is not counted. Both are in favour of Metropolis.
 
@@ -26,13 +28,15 @@
 
    Writes out/fig8.svg, out/fig8.csv (fixed starts), out/fig8_starts.svg, out/fig8_starts.csv. There, error is the
    relative median and error_se its standard error; bias2 (signed) and variance are in units of the truth's mean
-   square, with standard errors by a jackknife over the runs. */
+   square, and share is that of bias2 in their sum, with standard errors by a jackknife over the runs, or from the
+   spread over the pairs of points. */
 #define METRO_IMPLEMENTATION
 #include "../metro.h"
 #include "plot.h"
 #include "light.h"
 
-enum { LOOKS = 8, QUICK_LOOKS = 5, RUNS = 24, QUICK_RUNS = 4, BATCHES = 2, SIDE = 64, GRID = 32 };
+enum { LOOKS = 8, QUICK_LOOKS = 5, RUNS = 36, QUICK_RUNS = 8, PAIRS = 12, QUICK_PAIRS = 4, BATCHES = 2 };
+enum { SIDE = 64, GRID = 32 };
 enum { STARTS = 4, ANGLES = 2, MAIN = 6, CURVES = 12 };
 enum { FIXED, SEEDS, WEIGHTED, LARGE_STEPS };
 enum { RANDOM, EVEN, SMALL, MIDDLE, WIDE, ONE_DIRECTION }; /* the curves of the first sheet */
@@ -48,7 +52,7 @@ typedef struct {
 
 /* After so many walks: the median error of a run, its quartiles, and the parts of the mean squared error. */
 typedef struct {
-    measured error, bias2, variance;
+    measured error, bias2, variance, share; /* of bias in the squared error */
     double low, high;
 } verdict;
 
@@ -63,7 +67,7 @@ typedef struct {
 /* The part of the patches that the picture shows, with what they reflect. */
 typedef struct {
     metro_scene scene;
-    size_t visible, runs;
+    size_t visible, runs, pairs;
     size_t *patch;     /* [visible] */
     double *weight;    /* [visible]: what brings the squares of radiance to shares of the truth's power */
     double *truth;     /* [3 * visible], times the weight */
@@ -94,7 +98,6 @@ static metro_bundles_options options_of(const curve *c)
     options.batches = BATCHES;
     options.threads = 1;
     options.seed = 8;
-    options.start_seed = 8;
     options.walk = c->walk;
     options.start = c->start == SEEDS      ? METRO_START_SEEDS
                     : c->start == WEIGHTED ? METRO_START_WEIGHTED
@@ -185,6 +188,14 @@ static metro_result find_truth(figure *f)
 
 /* ---- The runs ---- */
 
+/* Runs in a row share their start points, or differ in nothing but random numbers. */
+static size_t runs_alike(const figure *f)
+{
+    const curve *c = f->now;
+    int is_fixed = c->walk == METRO_WALK_METROPOLIS && (c->start == FIXED || c->start == LARGE_STEPS);
+    return is_fixed ? f->runs / f->pairs : f->runs;
+}
+
 /* What brings the mean brightness to that of the truth; walks that know theirs keep it. */
 static double known_brightness(const figure *f, const metro_bundles *bundles)
 {
@@ -203,6 +214,7 @@ static metro_result one_run(uint64_t job, void *slot, void *user)
     metro_result result;
     size_t k;
     options.part = job;
+    options.start_seed = 1 + job / runs_alike(f);
     result = metro_bundles_make(&f->scene, &f->scene.camera, &options, &bundles);
     if (result != METRO_OK) return result;
     for (k = 0; k < f->now->looks && result == METRO_OK; k++) {
@@ -260,18 +272,48 @@ static void judge_median(const figure *f, const double *radiance, verdict *v)
     v->high = quantile(distance, f->runs, 0.75);
 }
 
+static measured measured_of(const metro_moments *moments)
+{
+    measured m;
+    m.value = metro_moments_mean(moments);
+    m.error = metro_moments_error(moments);
+    return m;
+}
+
+/* Bias and variance of runs that are alike; of several pairs of points the mean, with errors from their spread. A
+   bright point makes both large, so the error of their ratio is that of what each pair has too much of bias for it. */
 static metro_result judge(figure *f, size_t k)
 {
-    size_t values = 3 * f->visible;
+    size_t values = 3 * f->visible, alike = runs_alike(f), pairs = f->runs / alike, i;
     const double *radiance = f->radiance + k * f->runs * values;
     verdict *v = &f->now->at[k];
-    metro_bias_variance parts;
-    metro_result result = metro_repeats(radiance, f->truth, f->runs, values, &parts);
-    if (result != METRO_OK) return result;
-    v->bias2.value = parts.bias2 * (double)values - f->noise;
-    v->bias2.error = parts.bias2_error * (double)values;
-    v->variance.value = parts.variance * (double)values;
-    v->variance.error = parts.variance_error * (double)values;
+    metro_bias_variance parts[PAIRS];
+    metro_moments bias2, variance, excess;
+    double all;
+    memset(&bias2, 0, sizeof bias2);
+    memset(&variance, 0, sizeof variance);
+    memset(&excess, 0, sizeof excess);
+    for (i = 0; i < pairs; i++) {
+        metro_result result = metro_repeats(radiance + i * alike * values, f->truth, alike, values, &parts[i]);
+        if (result != METRO_OK) return result;
+        metro_moments_add(&bias2, parts[i].bias2 * (double)values - f->noise);
+        metro_moments_add(&variance, parts[i].variance * (double)values);
+    }
+    v->bias2 = measured_of(&bias2);
+    v->variance = measured_of(&variance);
+    all = v->bias2.value + v->variance.value;
+    v->share.value = v->bias2.value / all;
+    if (pairs == 1) {
+        v->bias2.error = parts[0].bias2_error * (double)values;
+        v->variance.error = parts[0].variance_error * (double)values;
+        v->share.error =
+            hypot(v->variance.value * v->bias2.error, v->bias2.value * v->variance.error) / (all * all);
+    } else {
+        for (i = 0; i < pairs; i++)
+            metro_moments_add(&excess, (double)values * (parts[i].bias2 * (1 - v->share.value)
+                                                         - parts[i].variance * v->share.value));
+        v->share.error = metro_moments_error(&excess) / all;
+    }
     judge_median(f, radiance, v);
     return METRO_OK;
 }
@@ -347,9 +389,9 @@ static int draw(const figure *f, const curve *curves)
              (int)look[last], metropolis, curves[best].perturbation, random, curves[EVEN].at[last].error.value);
     snprintf(note, sizeof note,
              "Relative error of the reflected light of the %d patches seen, median of %d runs; half of them lie in "
-             "the band. Walks of 7 bundles. A Metropolis run has two chains from fixed points and perturbs all "
-             "directions at once (solid) or one of them (dashed).",
-             (int)f->visible, (int)f->runs);
+             "the band. Walks of 7 bundles. A Metropolis run has two chains from fixed points, %d pairs of them in "
+             "turn, and perturbs all directions at once (solid) or one of them (dashed).",
+             (int)f->visible, (int)f->runs, (int)f->pairs);
     chart.title = title;
     chart.note = note;
     chart.height = 720;
@@ -390,11 +432,9 @@ static void draw_share(plot_panel *panel, const curve *c, const char *label)
     uint32_t color = plot_palette((size_t)c->start);
     size_t k;
     for (k = 0; k < c->looks; k++) {
-        const verdict *v = &c->at[k];
-        double all = v->bias2.value + v->variance.value;
         x[k] = look[k] * (1 + 0.04 * (c->start - 1.5)); /* side by side */
-        y[k] = 100 * v->bias2.value / all;
-        error[k] = 100 * hypot(v->variance.value * v->bias2.error, v->bias2.value * v->variance.error) / (all * all);
+        y[k] = 100 * c->at[k].share.value;
+        error[k] = 100 * c->at[k].share.error;
     }
     plot_line(panel, x, y, c->looks, label)->color = color;
     plot_points(panel, x, y, error, c->looks, NULL)->color = color;
@@ -403,8 +443,7 @@ static void draw_share(plot_panel *panel, const curve *c, const char *label)
 /* In percent; what is below 0 only by chance is 0. */
 static double bias_share(const curve *c, size_t k)
 {
-    double bias2 = fmax(c->at[k].bias2.value, 0);
-    return 100 * bias2 / (bias2 + c->at[k].variance.value);
+    return 100 * fmax(c->at[k].share.value, 0);
 }
 
 /* The curve of one start at one angle; fixed points are on the first sheet. */
@@ -442,10 +481,10 @@ static int draw_starts(const figure *f, const curve *curves)
              bias_share(fixed, 0), (int)look[0], bias_share(fixed, 4), (int)look[4], most);
     snprintf(
         note, sizeof note,
-        "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed). "
-        "Below: the share of bias, signed. %d runs of two chains. Large steps: one mutation in four, from the fixed "
-        "points. The title is for %g rad.",
-        (int)f->runs, fixed->perturbation);
+        "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed), in "
+        "the colours of below. There: the share of bias, signed. %d runs of two chains, the fixed points in %d pairs. "
+        "Large steps: one mutation in four, from the fixed points. The title is for %g rad.",
+        (int)f->runs, (int)f->pairs, fixed->perturbation);
     chart.title = title;
     chart.note = note;
     chart.rows = 2;
@@ -466,14 +505,15 @@ static int draw_starts(const figure *f, const curve *curves)
 static void write_verdict(plot_csv *csv, double perturbation, double walks, const verdict *v)
 {
     PLOT_CSV_ROW(csv, perturbation, walks, v->error.value, v->error.error, v->bias2.value, v->bias2.error,
-                 v->variance.value, v->variance.error);
+                 v->variance.value, v->variance.error, v->share.value, v->share.error);
 }
 
 static int write_main(const curve *curves)
 {
     static const char *const method[3] = { "random", "even", "metropolis" };
     plot_csv csv =
-        plot_csv_open("out/fig8.csv", "method,perturbation,walks,error,error_se,bias2,bias2_se,variance,variance_se");
+        plot_csv_open("out/fig8.csv", "method,perturbation,walks,error,error_se,bias2,bias2_se,variance,variance_se,"
+                                      "share,share_se");
     size_t k;
     int c;
     for (c = 0; c < ONE_DIRECTION; c++)
@@ -487,7 +527,7 @@ static int write_main(const curve *curves)
 static int write_starts(const curve *curves)
 {
     plot_csv csv = plot_csv_open("out/fig8_starts.csv", "start,directions,perturbation,walks,error,error_se,bias2,"
-                                                        "bias2_se,variance,variance_se");
+                                                        "bias2_se,variance,variance_se,share,share_se");
     size_t k;
     int c;
     for (c = SMALL; c < CURVES; c++)
@@ -544,11 +584,8 @@ static void report(const figure *f, const curve *curves)
                    start_name[curves[c].start]);
         for (k = 0; k < curves[c].looks; k++) printf(" %8.3f", curves[c].at[k].error.value);
         printf("\n%-40s", "  share of bias, %");
-        for (k = 0; k < curves[c].looks; k++) {
-            const verdict *v = &curves[c].at[k];
-            double all = v->bias2.value + v->variance.value;
-            printf(" %4.0f+-%-2.0f", 100 * v->bias2.value / all, 100 * v->bias2.error / all);
-        }
+        for (k = 0; k < curves[c].looks; k++)
+            printf(" %4.0f+-%-2.0f", 100 * curves[c].at[k].share.value, 100 * curves[c].at[k].share.error);
         printf("\n");
     }
 }
@@ -560,6 +597,7 @@ int main(void)
     metro_result result;
     size_t last;
     f.runs = plot_quick() ? QUICK_RUNS : RUNS;
+    f.pairs = plot_quick() ? QUICK_PAIRS : PAIRS;
     f.truth_walks = plot_quick() ? 1024 : 12288;
     plan_curves(curves, plot_quick() ? QUICK_LOOKS : LOOKS);
     if (light_load("fig8", "tests/data/S2.obj", &f.scene) != 0) return 1;
