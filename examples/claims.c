@@ -818,14 +818,16 @@ static void size_predicted(const table *const *t, finding *f)
 
 /* ---- Bundles of rays ---- */
 
-/* The row of a method with the fewest or the most walks; of metropolis the perturbation with the least error. */
-static size_t bundle_row(const table *t, const char *query, int most)
+enum { FEW = 8 }; /* walks, up to which there are few bundles */
+
+/* The row of a method with the most walks, up to `most`; of metropolis the perturbation with the least error. */
+static size_t bundle_row(const table *t, const char *query, double most)
 {
     size_t row = 0, best = 0;
     while ((row = row_next(t, row, query)) > 0) {
         double walks = number(t, row, "walks"), then = number(t, best, "walks");
-        if (best == 0 || (most ? walks > then : walks < then) ||
-            (walks == then && number(t, row, "error") < number(t, best, "error")))
+        if (walks > most) continue;
+        if (best == 0 || walks > then || (walks == then && number(t, row, "error") < number(t, best, "error")))
             best = row;
     }
     return best;
@@ -841,7 +843,7 @@ static void bundle_apart(const table *t, size_t a, size_t b, int side, finding *
 
 static void bundles_even(const table *const *t, finding *f)
 {
-    size_t a = bundle_row(t[0], "method=random", 1), b = bundle_row(t[0], "method=even", 1);
+    size_t a = bundle_row(t[0], "method=random", (double)INFINITY), b = bundle_row(t[0], "method=even", (double)INFINITY);
     bundle_apart(t[0], a, b, 1, f);
     snprintf(f->words, sizeof f->words, "%.0f walks: error %.3g random less %.3g even is %.2g +- %.1g",
              number(t[0], a, "walks"), number(t[0], a, "error"), number(t[0], b, "error"), f->value, f->error);
@@ -849,7 +851,7 @@ static void bundles_even(const table *const *t, finding *f)
 
 static void bundles_worse(const table *const *t, finding *f)
 {
-    size_t a = bundle_row(t[0], "method=metropolis", 0), b = bundle_row(t[0], "method=random", 0);
+    size_t a = bundle_row(t[0], "method=metropolis", FEW), b = bundle_row(t[0], "method=random", FEW);
     bundle_apart(t[0], a, b, 1, f);
     snprintf(f->words, sizeof f->words,
              "%.0f walks: error %.3g Metropolis (best size) less %.3g random is %.2g +- %.1g",
@@ -866,14 +868,14 @@ static double bundle_extreme(const table *t, int side)
     return found;
 }
 
-/* The share of bias^2 in the squared error, the mean over the numbers of walks up to `few`. One run gives them all, so
+/* The share of bias^2 in the squared error, the mean over the numbers of walks up to FEW. One run gives them all, so
    their errors go together and are added up as they are. */
-static outcome bundle_bias(const table *t, double perturbation, double few, finding *f)
+static outcome bundle_bias(const table *t, double perturbation, finding *f)
 {
     double share = 0, error = 0, rows = 0;
     size_t row;
     for (row = row_next(t, 0, "method=metropolis"); row > 0; row = row_next(t, row, "method=metropolis")) {
-        if (number(t, row, "perturbation") != perturbation || number(t, row, "walks") > few) continue;
+        if (number(t, row, "perturbation") != perturbation || number(t, row, "walks") > FEW) continue;
         share += number(t, row, "share");
         error += number(t, row, "share_se");
         rows++;
@@ -884,12 +886,11 @@ static outcome bundle_bias(const table *t, double perturbation, double few, find
 
 static void bundles_biased(const table *const *t, finding *f)
 {
-    enum { FEW = 8 };
     double small = bundle_extreme(t[0], -1), large = bundle_extreme(t[0], 1), share, error;
-    outcome first = bundle_bias(t[0], small, FEW, f), second;
+    outcome first = bundle_bias(t[0], small, f), second;
     share = f->value;
     error = f->error;
-    second = bundle_bias(t[0], large, FEW, f);
+    second = bundle_bias(t[0], large, f);
     f->is = judge_both(first, second, "the perturbation is small", f);
     snprintf(f->words, sizeof f->words,
              "up to %d walks from fixed points: bias^2 is %.0f +- %.0f %% of the squared error at %.1f rad; "
@@ -901,7 +902,7 @@ static void bundles_biased(const table *const *t, finding *f)
 static void bundles_smaller(const table *const *t, finding *f)
 {
     const char *name = "";
-    size_t a = bundle_row(t[0], "method=random", 1), b = bundle_row(t[0], "method=metropolis", 1);
+    size_t a = bundle_row(t[0], "method=random", (double)INFINITY), b = bundle_row(t[0], "method=metropolis", (double)INFINITY);
     double e, paths = advantage(t[1], "hidden", &e, &name) / 2;
     double ratio = log(number(t[0], a, "error") / number(t[0], b, "error"));
     double error = hypot(number(t[0], a, "error_se") / number(t[0], a, "error"),

@@ -12,9 +12,8 @@
    are many independent runs. Metropolis chains start at fixed points, one for each of the two, the first of uniform
    draws that are not dark. What such a point leaves in the picture depends on the point, so there are twelve pairs of
    points, each for a share of the runs, and bias and variance are means over the pairs; the second sheet compares
-   other starts. How bright the picture
-   is in the mean is taken from the truth, but not with weighted seeds, which bring it along. What a start costs, up
-   to 16 walks for a chain, is not counted. Both are in favour of Metropolis.
+   other starts. How bright the picture is in the mean is taken from the truth, but not with weighted seeds, which
+   bring it along. What a start costs, up to 16 walks for a chain, is not counted. Both are in favour of Metropolis.
 
    The curves are medians, and half of all runs lie in the bands. Means would say less: now and then several
    directions in a row hit the highlights of the floor and the block, the factors of these multiply, and one walk
@@ -254,22 +253,38 @@ static double quantile(const double *sorted, size_t count, double at)
     return sorted[below] + (place - (double)below) * (sorted[above] - sorted[below]);
 }
 
-/* The median over the runs and its standard error, from how many of n numbers lie below the median: n/2 with the
-   standard deviation sqrt(n)/2 (David and Nagaraja 2003, section 7.1). */
-static void judge_median(const figure *f, const double *radiance, verdict *v)
+/* How far the share of runs that lie below a number is off: 1/2 over sqrt(n) for n runs near the median (David and
+   Nagaraja 2003, section 7.1); where runs share their start points, by its spread over the pairs of points. */
+static double share_error(const double *distance, double at, size_t runs, size_t alike)
 {
-    double distance[RUNS], n = (double)f->runs, step = 0.5 / sqrt(n);
+    metro_moments below;
+    size_t first, r;
+    if (alike == runs) return 0.5 / sqrt((double)runs);
+    memset(&below, 0, sizeof below);
+    for (first = 0; first < runs; first += alike) {
+        double count = 0;
+        for (r = first; r < first + alike; r++) count += distance[r] < at ? 1 : distance[r] > at ? 0 : 0.5;
+        metro_moments_add(&below, count / (double)alike);
+    }
+    return metro_moments_error(&below);
+}
+
+/* The median over the runs with its standard error, and the quartiles. */
+static void judge_median(const figure *f, const double *radiance, size_t alike, verdict *v)
+{
+    double distance[RUNS], sorted[RUNS], step;
     size_t r, i, values = 3 * f->visible;
     for (r = 0; r < f->runs; r++) {
         double squared = -f->noise;
         for (i = 0; i < values; i++) squared += pow(radiance[r * values + i] - f->truth[i], 2);
-        distance[r] = sqrt(fmax(squared, 0));
+        sorted[r] = distance[r] = sqrt(fmax(squared, 0));
     }
-    qsort(distance, f->runs, sizeof *distance, smaller_first);
-    v->error.value = quantile(distance, f->runs, 0.5);
-    v->error.error = 0.5 * (quantile(distance, f->runs, 0.5 + step) - quantile(distance, f->runs, 0.5 - step));
-    v->low = quantile(distance, f->runs, 0.25);
-    v->high = quantile(distance, f->runs, 0.75);
+    qsort(sorted, f->runs, sizeof *sorted, smaller_first);
+    v->error.value = quantile(sorted, f->runs, 0.5);
+    step = share_error(distance, v->error.value, f->runs, alike);
+    v->error.error = 0.5 * (quantile(sorted, f->runs, 0.5 + step) - quantile(sorted, f->runs, 0.5 - step));
+    v->low = quantile(sorted, f->runs, 0.25);
+    v->high = quantile(sorted, f->runs, 0.75);
 }
 
 static measured measured_of(const metro_moments *moments)
@@ -314,7 +329,7 @@ static metro_result judge(figure *f, size_t k)
                                                          - parts[i].variance * v->share.value));
         v->share.error = metro_moments_error(&excess) / all;
     }
-    judge_median(f, radiance, v);
+    judge_median(f, radiance, alike, v);
     return METRO_OK;
 }
 
