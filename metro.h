@@ -1376,8 +1376,7 @@ typedef struct {
 /* What a careful person asks of a picture. NaN stands for what a method does not have. */
 typedef struct {
     double mean, mean_error;       /* the mean luminance of the picture and its standard error. Even points (see
-                                      random_numbers) are better than their error says, least with many
-                                      rounds */
+                                      random_numbers) are better than their error says, least with many rounds */
     double b, b_error;             /* the integral of the importance, and its standard error: infinite where b is 0 */
     double acceptance;             /* the share of mutations that were accepted */
     double dark;                   /* the share of tentative states of zero importance */
@@ -1394,7 +1393,7 @@ typedef struct {
    METRO_ERROR_ARGUMENT for a scene that is not built, a camera that metro_camera_check refuses or options out of
    range (NULL: all defaults), METRO_ERROR_NO_LIGHT for a scene without a lamp, METRO_ERROR_MEMORY; `render` is then
    unchanged. Cost: METRO_PSSMLT traces two rounds of METRO_BDPT for its pilot. Memory: 24 bytes a pixel, 8 bytes for
-   each chain (or 16) and block of 8 x 8 pixels, and with a pyramid of depth K 24 (K + 1)(K + 2) bytes a pixel. */
+   each chain (or 32) and block of 8 x 8 pixels, and with a pyramid of depth K 24 (K + 1)(K + 2) bytes a pixel. */
 METRO_API metro_result metro_render_make(const metro_scene *scene, const metro_camera *camera,
                                          const metro_render_options *options, metro_render *render);
 
@@ -1415,7 +1414,7 @@ METRO_API metro_result metro_render_image(const metro_render *render, metro_imag
 METRO_API metro_result metro_render_way(const metro_render *render, int s, int t, metro_image *image);
 
 /* The mean luminance of block (column, row) of 8 x 8 pixels and its standard error, which may not be NULL: from the
-   spread over the chains, or over sixteen groups of rounds. NaN where there is no such block or too little to say.
+   spread over the chains, or over 16 to 32 runs of rounds. NaN where there is no such block or too little to say.
    Cost: all blocks times the chains. */
 METRO_API double metro_render_block(const metro_render *render, size_t column, size_t row, double *error);
 
@@ -13457,12 +13456,12 @@ static metro_result metroi_path_merge(uint64_t job, const void *slot, void *user
 
 static void metroi_canvas_pair(metroi_canvas *canvas)
 {
-    size_t blocks = canvas->columns * canvas->rows, b, i;
-    for (b = 0; b < canvas->batches; b++) {
-        double *block = canvas->block + b * blocks;
-        const double *first = canvas->block + 2 * b * blocks, *second = first + blocks;
-        for (i = 0; i < blocks; i++) block[i] = 2 * b < canvas->batches ? first[i] + second[i] : 0;
+    size_t blocks = canvas->columns * canvas->rows, half = canvas->batches / 2, b, i;
+    for (b = 0; b < half; b++) {
+        const double *first = canvas->block + 2 * b * blocks;
+        for (i = 0; i < blocks; i++) canvas->block[b * blocks + i] = first[i] + first[blocks + i];
     }
+    memset(canvas->block + half * blocks, 0, half * blocks * sizeof(double));
     canvas->run *= 2;
 }
 

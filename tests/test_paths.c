@@ -402,7 +402,7 @@ static void pyramid_sums(void)
 
 /* ---- methods against methods ---- */
 
-/* The blocks of two renders agree within their joint errors, each of 16 groups of rounds, and so do the means. */
+/* The blocks of two renders agree within their joint errors, each of 16 runs of rounds or more, and so do the means. */
 static void compare_renders(const metro_render *a, const metro_render *b, const char *what)
 {
     metro_render_report ra, rb;
