@@ -13279,7 +13279,7 @@ static double metroi_log_add(metroi_log *log, const metroi_splat *splat, double 
 
 typedef struct {
     size_t width, height, columns, rows, batches;
-    uint64_t run;    /* rounds in a batch, without chains */
+    uint64_t batch_rounds; /* without chains */
     double *sum;     /* [3 * width * height] */
     double *way;     /* [ways * 3 * width * height] or NULL */
     double *block;   /* [batches * columns * rows] */
@@ -13320,7 +13320,7 @@ static metro_result metroi_canvas_make(size_t width, size_t height, size_t batch
     canvas->columns = (width + 7) / 8;
     canvas->rows = (height + 7) / 8;
     canvas->batches = batches;
-    canvas->run = 1;
+    canvas->batch_rounds = 1;
     canvas->depth = depth;
     canvas->sum = (double *)metroi_zeros(pixels, 3 * sizeof(double));
     canvas->block = (double *)metroi_zeros(batches, canvas->columns * canvas->rows * sizeof(double));
@@ -13446,15 +13446,15 @@ static metro_result metroi_path_merge(uint64_t job, const void *slot, void *user
     const metroi_path_plan *plan = (const metroi_path_plan *)user;
     const metroi_log *log = (const metroi_log *)slot;
     if (plan->look != NULL) plan->look(log, plan->user);
-    metroi_canvas_add(plan->canvas, log, (size_t)(job / plan->jobs / plan->canvas->run));
+    metroi_canvas_add(plan->canvas, log, (size_t)(job / plan->jobs / plan->canvas->batch_rounds));
     return METRO_OK;
 }
 
-/* Each batch is a run of $2^k$ rounds, in which even points are as even as they are: the spread of such runs says
-   more of the picture than that of single rounds, or of every n-th. When all batches are full, neighbours become
-   one. */
+/* Each batch is a run of $2^k$ rounds, in which even points are as even as so many can be. Rounds from here and there
+   would lie like random numbers, and their spread not show what evenness gains. When all batches are full,
+   neighbours become one. */
 
-static void metroi_canvas_pair(metroi_canvas *canvas)
+static void metroi_canvas_join_batches(metroi_canvas *canvas)
 {
     size_t blocks = canvas->columns * canvas->rows, half = canvas->batches / 2, b, i;
     for (b = 0; b < half; b++) {
@@ -13462,14 +13462,14 @@ static void metroi_canvas_pair(metroi_canvas *canvas)
         for (i = 0; i < blocks; i++) canvas->block[b * blocks + i] = first[i] + first[blocks + i];
     }
     memset(canvas->block + half * blocks, 0, half * blocks * sizeof(double));
-    canvas->run *= 2;
+    canvas->batch_rounds *= 2;
 }
 
 /* Round number `round`. */
 static metro_result metroi_path_round(metroi_path_plan *plan, uint64_t round)
 {
     metro_rounds rounds;
-    if (round / plan->canvas->run == plan->canvas->batches) metroi_canvas_pair(plan->canvas);
+    if (round / plan->canvas->batch_rounds == plan->canvas->batches) metroi_canvas_join_batches(plan->canvas);
     memset(&rounds, 0, sizeof rounds);
     plan->jobs = metroi_path_jobs(plan->canvas->width * plan->canvas->height);
     rounds.jobs = METROI_ROUND_JOBS;
@@ -13902,7 +13902,7 @@ static metro_result metroi_pilot_run(metroi_metropolis *plan)
     metroi_path_plan paths;
     size_t ways = (size_t)(plan->tracer.depth + 1) * (size_t)(plan->tracer.depth + 2) / 2;
     size_t width = plan->canvas->width, height = plan->canvas->height;
-    metro_result result = metroi_canvas_make(width, height, METROI_PATH_BATCHES, plan->tracer.depth, 0, &canvas);
+    metro_result result = metroi_canvas_make(width, height, 1, plan->tracer.depth, 0, &canvas);
     if (result != METRO_OK) return result;
     if (!plan->options->all_connections) plan->way = (metroi_way *)metroi_zeros(ways, sizeof *plan->way);
     memset(&paths, 0, sizeof paths);
@@ -14475,8 +14475,8 @@ static double metroi_window_expect(const metro_render *render, size_t c, double 
     const metroi_render *state = (const metroi_render *)render->state;
     const metroi_canvas *canvas = &state->canvas;
     if (!metroi_render_walks(&render->options)) {
-        uint64_t before = c * canvas->run, rounds = render->rounds > before ? render->rounds - before : 0;
-        if (rounds > canvas->run) rounds = canvas->run;
+        uint64_t before = c * canvas->batch_rounds, rounds = render->rounds > before ? render->rounds - before : 0;
+        if (rounds > canvas->batch_rounds) rounds = canvas->batch_rounds;
         return rounds > 0 ? sum * (double)rounds / (double)render->rounds : METROI_NAN;
     }
     if (render->options.start == METRO_START_WEIGHTED) return sum / (double)canvas->batches;
@@ -16210,7 +16210,8 @@ static void metroi_walk_step(metroi_bundles *plan, size_t index, uint64_t round)
    [figure: fig7.svg | A room with diffuse and specular surfaces, its lamp hidden from the eye (figure 7 of the
    paper).] */
 
-enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6, METROI_GATHER_RAYS = 36 };
+enum { METROI_GATHER_JOBS = 16, METROI_GATHER_SIDE = 6,
+       METROI_GATHER_RAYS = METROI_GATHER_SIDE * METROI_GATHER_SIDE };
 
 /* The patch that the ray through (x, y) sees from its front, and where it was hit; the number of patches if there is
    none. */

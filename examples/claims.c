@@ -818,7 +818,7 @@ static void size_predicted(const table *const *t, finding *f)
 
 /* ---- Bundles of rays ---- */
 
-enum { FEW = 8 }; /* walks, up to which there are few bundles */
+enum { FEW = 8, MOST = 1000000 }; /* walks: up to so many there are few bundles; more than any run makes */
 
 /* The row of a method with the most walks, up to `most`; of metropolis the perturbation with the least error. */
 static size_t bundle_row(const table *t, const char *query, double most)
@@ -843,7 +843,7 @@ static void bundle_apart(const table *t, size_t a, size_t b, int side, finding *
 
 static void bundles_even(const table *const *t, finding *f)
 {
-    size_t a = bundle_row(t[0], "method=random", (double)INFINITY), b = bundle_row(t[0], "method=even", (double)INFINITY);
+    size_t a = bundle_row(t[0], "method=random", MOST), b = bundle_row(t[0], "method=even", MOST);
     bundle_apart(t[0], a, b, 1, f);
     snprintf(f->words, sizeof f->words, "%.0f walks: error %.3g random less %.3g even is %.2g +- %.1g",
              number(t[0], a, "walks"), number(t[0], a, "error"), number(t[0], b, "error"), f->value, f->error);
@@ -902,7 +902,7 @@ static void bundles_biased(const table *const *t, finding *f)
 static void bundles_smaller(const table *const *t, finding *f)
 {
     const char *name = "";
-    size_t a = bundle_row(t[0], "method=random", (double)INFINITY), b = bundle_row(t[0], "method=metropolis", (double)INFINITY);
+    size_t a = bundle_row(t[0], "method=random", MOST), b = bundle_row(t[0], "method=metropolis", MOST);
     double e, paths = advantage(t[1], "hidden", &e, &name) / 2;
     double ratio = log(number(t[0], a, "error") / number(t[0], b, "error"));
     double error = hypot(number(t[0], a, "error_se") / number(t[0], a, "error"),

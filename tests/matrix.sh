@@ -113,8 +113,6 @@ if have gcc; then
         cmp $work/METRO_NO_SIMD.pfm $work/METRO_WITH_SIMD.pfm"
     later "no private macro leaks" \
         "gcc -std=c99 -dM -E $work/all.c | grep 'define METROI_' | grep -vE 'METROI_(UNUSED|H)\b' || true"
-fi
-if have gcc; then
     later "examples, without a warning" "for f in examples/*.c; do
             gcc -std=c99 -Wall -Wextra -pedantic -fsyntax-only \$f
         done"
