@@ -496,9 +496,9 @@ static int draw_starts(const figure *f, const curve *curves)
              bias_share(fixed, 0), (int)look[0], bias_share(fixed, 4), (int)look[4], most);
     snprintf(
         note, sizeof note,
-        "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed), in "
-        "the colours of below. There: the share of bias, signed. %d runs of two chains, the fixed points in %d pairs. "
-        "Large steps: one mutation in four, from the fixed points. The title is for %g rad.",
+        "Above: squared bias (solid, with standard errors, left out below two of them) and variance (dashed). Below, "
+        "in the same colours: the share of bias, signed. %d runs of two chains, the fixed points in %d pairs. Large "
+        "steps: one mutation in four, from the fixed points. The title is for %g rad.",
         (int)f->runs, (int)f->pairs, fixed->perturbation);
     chart.title = title;
     chart.note = note;
